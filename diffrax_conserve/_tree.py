@@ -55,6 +55,11 @@ def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
     return jtu.tree_unflatten(treedef, out)
 
 
+def eps_of(x: Any) -> float:
+    """The unit of roundoff of an array, or of a dtype."""
+    return float(jnp.finfo(jnp.result_type(x)).eps)
+
+
 def tree_size(a: Any) -> int:
     """The number of scalars in `a`."""
     return sum(math.prod(jnp.shape(x)) for x in jtu.tree_leaves(a))

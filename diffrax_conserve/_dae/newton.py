@@ -14,6 +14,7 @@ from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import DenseRows
+from .._tree import eps_of
 
 # Newton's method ends after this many attempts at a correction. In a solve it needs a few. From a
 # rough guess it may need many: if the voltage at a diode is guessed too large, each correction
@@ -61,7 +62,7 @@ class _Factored(NamedTuple):
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
-        return jnp.all(pivots > ROUNDOFF * float(jnp.finfo(pivots.dtype).eps))
+        return jnp.all(pivots > ROUNDOFF * eps_of(pivots))
 
     def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
         """For each unknown the least change that the largest term of one of its equations stands
@@ -105,7 +106,7 @@ class SparseNewton:
 
     def at_roundoff(self, residual: Residual, z: Float[Array, " m"]) -> Bool[Array, ""]:
         sizes = self.places.matvec(jnp.abs(self.found.values(residual, z)), jnp.abs(z))
-        return jnp.all(jnp.abs(residual(z)) <= ROUNDOFF * float(jnp.finfo(z.dtype).eps) * sizes)
+        return jnp.all(jnp.abs(residual(z)) <= ROUNDOFF * eps_of(z) * sizes)
 
     def jacobian(self, residual: Residual) -> Residual:
         return lambda z: self.found.values(residual, z)
@@ -130,7 +131,7 @@ def algebraic_newton(
         if sparse is not None:
             return sparse.at_roundoff(residual, z)
         g, jacobian, hidden = cancellation_terms(residual, z)
-        limit = ROUNDOFF * float(jnp.finfo(z.dtype).eps)
+        limit = ROUNDOFF * eps_of(z)
         scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
         return jnp.all(jnp.abs(g) <= limit * scale)
 
@@ -155,7 +156,7 @@ def at_rest_near(
     helps, perhaps because of roundoff: whether that is a root, the residual must tell. The result
     is NaN if corrections become infinite, or the Jacobian is singular.
     """
-    eps = float(jnp.finfo(z.dtype).eps)
+    eps = eps_of(z)
     linearised = _Factored.at if sparse is None else sparse.at
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:

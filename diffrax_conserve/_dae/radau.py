@@ -20,7 +20,7 @@ from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
 from .._time import nonzero_length
-from .._tree import ravel, unravel
+from .._tree import eps_of, ravel, unravel
 from .stage_systems import systems_at
 
 # The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
@@ -167,7 +167,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
         sizes = systems.sizes_of_terms(start, start / length)
-        least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
+        least = ROUNDOFF * eps_of(start) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
         real, pair = systems.solvers(_REAL / length, _PAIR / length)
 
@@ -193,7 +193,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             now_size = size(change, new)
             rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
             # A change by the roundoff of the state cannot become smaller.
-            rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
+            rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
             settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
             return keep_done(tests_left, (new, now_size), now), left_after_step(
                 settled, rate < 2, tests_left

@@ -35,7 +35,7 @@ from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import AbstractRows
 from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
-from .._tree import key_of, ravel, unravel, without_pattern
+from .._tree import eps_of, key_of, ravel, unravel, without_pattern
 
 Entry = FirstIntegral | Constraint
 
@@ -169,7 +169,7 @@ def check_invariance(
     check_vector_field(vector_field)
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
-        rtol = _ROUNDOFF * float(jnp.finfo(ts.dtype).eps)
+        rtol = _ROUNDOFF * eps_of(ts)
     with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
         one_time = np.all(ts == ts[0])

@@ -25,7 +25,7 @@ from .._numerics.problem import relative_to_scale, residuals_and_scales
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_solution
 from .._time import FieldTime
-from .._tree import ravel, tree_add, tree_shapes, tree_sub
+from .._tree import eps_of, ravel, tree_add, tree_shapes, tree_sub
 
 
 def drift(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Values:
@@ -143,7 +143,7 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         g = ravel(residual(t, y))
         _, jacobian, hidden = cancellation_scale(manifold, t, y, args)
         scale = numbers + jacobian.absolute_matvec(jnp.abs(ravel(y))) + hidden
-        limit = 2 * ROUNDOFF * float(jnp.finfo(g.dtype).eps) * scale
+        limit = 2 * ROUNDOFF * eps_of(g) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 
     return jax.vmap(at)(ts, ys)

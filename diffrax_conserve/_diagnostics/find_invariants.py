@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Real
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral, check_vector_field, slope_of
 from .._options import check_counts, check_function, one_of
-from .._tree import ravel, real_view, tree_size, unravel
+from .._tree import eps_of, ravel, real_view, tree_size, unravel
 from .check_invariance import LATER, batch
 
 try:
@@ -375,7 +375,7 @@ def _sampled(
             "none of `states`, so they are not in general position. Let every component vary."
         )
     slope = eqx.filter_eval_shape(vector_field, ts[0], _one(ys), args)
-    eps = max(float(jnp.finfo(jnp.result_type(float, x)).eps) for x in jtu.tree_leaves(slope))
+    eps = max(eps_of(jnp.result_type(float, x)) for x in jtu.tree_leaves(slope))
     return _Samples(values, gradients, slopes, eps)
 
 

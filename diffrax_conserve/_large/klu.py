@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
-from .._tree import without_pattern
+from .._tree import eps_of, without_pattern
 from .asdex_import import asdex
 from .detection import constants_of, content_key, jacobian_places
 
@@ -141,7 +141,7 @@ class Places:
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
         scaled = values / heights / widths + _TINY * 1j * shift
         x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))
-        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(values.dtype).eps)))
+        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * eps_of(values)))
 
     def _klu(self, name: str, values: Array, b: Array) -> Array:
         """Calls KLU; `b` may have several columns. The primitives are bound themselves, because the

@@ -15,7 +15,7 @@ from .._numerics.implicit import root
 from .._numerics.iterate import Solved
 from .._options import check_counts
 from .._projection.options import option
-from .._tree import ravel, tree_stop_gradient, unravel
+from .._tree import eps_of, ravel, tree_stop_gradient, unravel
 
 
 @final
@@ -95,7 +95,7 @@ class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
             return ravel(jtu.tree_map(lambda k, new, unit: (k - new) / unit, k, new, units))
 
         guess = ravel(jtu.tree_map(lambda k, unit: k / unit, k0, units))
-        eps = float(jnp.finfo(guess.dtype).eps)
+        eps = eps_of(guess)
         finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
 
         def newton(guess: Float[Array, " n"]) -> Solved:

@@ -37,7 +37,7 @@ from .._solver.failure import failure_cause, masked_step, starts_off_manifold
 from .._solver.state import initial_values
 from .._solver.terms import in_field_time, is_backsolve, is_ode
 from .._time import nonzero_length
-from .._tree import ravel, tree_shapes, unflatten, unravel
+from .._tree import eps_of, ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
 
 
@@ -217,7 +217,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         lengths = jnp.sqrt(squares.matvec(jnp.ones_like(ravel(v))))
         limit = lengths * problem.factor.norm(drift(ravel(v))) + jnp.abs(rate)
         moves = rate + at.jacobian.matvec(drift(ravel(v)))
-        off = ~jnp.all(jnp.abs(moves) <= float(jnp.finfo(moves.dtype).eps) ** 0.5 * limit)
+        off = ~jnp.all(jnp.abs(moves) <= eps_of(moves) ** 0.5 * limit)
         off = off | starts_off_manifold(problem, self.constraint, ravel(q))
         slope = terms[1].vf(t0, q, args)
         return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off)

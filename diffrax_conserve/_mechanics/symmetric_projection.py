@@ -36,7 +36,7 @@ from .._solver.state import initial_values
 from .._solver.statistics import ProjectionStatistics
 from .._solver.terms import check_root_finder, in_field_time, innermost, refuse_backsolve
 from .._solver.wrapper import ForwardingSolver
-from .._tree import ravel, unravel
+from .._tree import eps_of, ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
 # Methods of even order without coefficients to judge by: two that undo their steps only with their
@@ -242,7 +242,7 @@ def _solved(
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
     sizes, first = start.gradients(y0).scaled()
-    gram0, eps = first.gram(first), float(jnp.finfo(y0.dtype).eps)
+    gram0, eps = first.gram(first), eps_of(y0)
 
     def stepped(multiplier: Array, rows: AbstractRows | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import NUM_REFINEMENTS, ROUNDOFF
+from .._tree import eps_of
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
 
@@ -137,4 +138,4 @@ def _exchange(x: list[Any], k: int, i: int, exchanged: Bool[Array, ""]) -> None:
 
 def roundoff_pivot_tolerance(dtype: Any) -> float:
     """The largest share of the diagonal that a pivot can be by roundoff alone."""
-    return ROUNDOFF * float(jnp.finfo(dtype).eps)
+    return ROUNDOFF * eps_of(dtype)

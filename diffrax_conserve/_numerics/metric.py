@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from .._constants import REGULARISATION_POWER
 from .._custom_types import Args, RealScalarLike, Y
 from .._options import check_function, check_number
-from .._tree import ravel, real_view
+from .._tree import eps_of, ravel, real_view
 from .rows import AbstractRows, DenseRows
 
 
@@ -201,7 +201,7 @@ class PreferredSubspace(AbstractFactor):
 
 def _COMPLEMENT_DAMPING(dtype: Any) -> float:
     """`δ` of `PreferredSubspace`."""
-    return float(jnp.finfo(dtype).eps) ** (REGULARISATION_POWER / 2)
+    return eps_of(dtype) ** (REGULARISATION_POWER / 2)
 
 
 def positive_weights(metric: PyTree[ArrayLike | Callable] | None) -> PyTree[Any] | None:

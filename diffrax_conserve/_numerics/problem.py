@@ -30,7 +30,7 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
 from .._manifold import evaluate, is_entry, named_entries
-from .._tree import key_of, ravel, tree_stop_gradient, unflatten, unravel
+from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows
@@ -150,7 +150,7 @@ class Problem(eqx.Module):
         return self.magnitude + jacobian.absolute_matvec(size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
-        eps = float(jnp.finfo(scale.dtype).eps)
+        eps = eps_of(scale)
         rtol = ROUNDOFF * eps if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
@@ -240,7 +240,7 @@ def step_norm(
     the roundoff of the residuals alone moves a state by about that much. Without this floor a step
     at rest would have no length, and every correction would be longer than it.
     """
-    floor = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
+    floor = eps_of(end) ** 0.5 * jnp.abs(end)
     return factor.norm(jnp.maximum(jnp.abs(end - start), floor))
 
 

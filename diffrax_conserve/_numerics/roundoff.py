@@ -31,7 +31,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import pattern_of
 from .._manifold import calling_fn, named_entries
-from .._tree import ravel, tree_stop_gradient
+from .._tree import eps_of, ravel, tree_stop_gradient
 from .problem import functions_of
 from .rows import AbstractRows, DenseRows
 from .sparse_rows import SparseRows
@@ -129,7 +129,7 @@ def _rounded(x: Array, size: Array, total: Array, squares: Array) -> Array:
 def _adjoint(given: tuple[Array, Array], adjoint: Array) -> tuple[Array, ...]:
     size, total = given
     # A cast to a lower precision has a larger unit of roundoff than the state.
-    unit = float(jnp.finfo(adjoint.dtype).eps) / float(jnp.finfo(total.dtype).eps)
+    unit = eps_of(adjoint) / eps_of(total)
     terms = unit * jnp.abs(adjoint * size).astype(total.dtype)
     # A term that is not finite says nothing of roundoff: the value itself is not finite then, or
     # its derivative is infinite.

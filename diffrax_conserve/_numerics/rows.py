@@ -33,6 +33,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_BLOCK, REGULARISATION_POWER, WRITTEN_OUT
+from .._tree import eps_of
 from .linear import (
     Solve,
     forward_elimination,
@@ -109,7 +110,7 @@ class AbstractRows(eqx.Module):
     def derivative_pivot_tolerance(self) -> float:
         """The least pivot of unit rows that counts in a derivative, `√ε`. As a pivot has an error
         of about `ε`, half of the digits of what is divided by it are right."""
-        return float(jnp.finfo(self.dtype).eps) ** 0.5
+        return eps_of(self.dtype) ** 0.5
 
     def best_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
         """The `λ` for which `Uᵀ λ` is nearest to a change, without nearly dependent rows."""
@@ -252,7 +253,7 @@ class RegularisedGram(AbstractGram):
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         matrix, unit = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
-        eps, one = float(jnp.finfo(matrix.dtype).eps), jnp.eye(len(matrix), dtype=dtype)
+        eps, one = eps_of(matrix), jnp.eye(len(matrix), dtype=dtype)
         added = (
             eps**REGULARISATION_POWER * len(matrix) ** 0.5
             if pivot_tolerance is None

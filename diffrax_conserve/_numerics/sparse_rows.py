@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from .._constants import REGULARISATION_POWER
 from .._large.klu import Places, available
 from .._large.sparse import Pattern, take
+from .._tree import eps_of
 from .linear import Solve, inverse_factors
 from .rows import AbstractGram, AbstractRows
 
@@ -147,7 +148,7 @@ class BlockGram(AbstractGram):
         del pivot_tolerance
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
-        added = block**0.5 * float(jnp.finfo(self.diagonal.dtype).eps) ** REGULARISATION_POWER
+        added = block**0.5 * eps_of(self.diagonal) ** REGULARISATION_POWER
         # A diagonal element is zero for padding, and for a constraint without a gradient. With a
         # one in its place the multiplier of such a row is its right side.
         unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)
@@ -222,7 +223,7 @@ def _iterated(gram: BlockGram, diagonal: Array, b: Array) -> Array:
     def solve(product: Callable[[Array], Array], b: Array) -> Array:
         # The iterations of Newton's method correct what an inexact solution leaves, so this is less
         # accurate than could be had.
-        tol = float(jnp.finfo(b.dtype).eps) ** (3 / 4)
+        tol = eps_of(b) ** (3 / 4)
         return bicgstab(product, b, tol=tol, M=lambda x: x / diagonal[..., 0])[0]
 
     product = lambda x: pattern.taken_apart(gram.matvec(pattern.joined(x, zero)))[0]  # noqa: E731

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Inexact
 
 from .._custom_types import Args, RealScalarLike, Values
 from .._options import calling, check_function
+from .._tree import eps_of
 from .closed_form import ClosedForm
 
 Matrices = Inexact[Array, "*batch n n"]
@@ -216,7 +217,7 @@ def _spectral(x: Matrices) -> tuple[Array, Array, Array, Array, Array]:
     _check_square(x)
     w, v = jnp.linalg.eigh(_hermitian(x), symmetrize_input=False)
     n = w.shape[-1]
-    least = 2 * n * float(jnp.finfo(w.dtype).eps)
+    least = 2 * n * eps_of(w)
     p, positive = _onto_simplex(w, least)
     root = v * jnp.sqrt(p)[..., None, :]
     # The upper triangle is made from the lower one. Half the sum of the matrix and its adjoint

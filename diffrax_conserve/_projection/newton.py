@@ -24,7 +24,7 @@ from .._numerics.metric import Identity
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .._numerics.rows import solve_kkt
-from .._tree import tree_stop_gradient
+from .._tree import eps_of, tree_stop_gradient
 from .options import NEWTON_OPTIONS
 from .within_bounds import AbstractNewton, Bounds, project_within
 
@@ -146,7 +146,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
     scale = problem.scale(jacobian, y)
-    eps = float(jnp.finfo(y.dtype).eps)
+    eps = eps_of(y)
 
     def tolerance(default: float, of_user: Any) -> Array:
         """The tolerances of the user are for the constraints. The others hold to roundoff."""

@@ -15,6 +15,7 @@ from .._constants import ROUNDOFF
 from .._custom_types import BoolScalarLike, Manifold, RealScalarLike
 from .._manifold import Constraint, is_entry
 from .._numerics.problem import Problem
+from .._tree import eps_of
 from .diffrax_private import member, register
 
 _ENTRY = (
@@ -66,7 +67,7 @@ def starts_off_manifold(
     """
     g, jacobian = problem.linearise(y)
     scale = problem.scale(jacobian, y)
-    limit = jnp.maximum(float(jnp.finfo(y.dtype).eps) ** 0.5 * scale, problem.tolerance(scale))
+    limit = jnp.maximum(eps_of(y) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
     counts = problem.per_residual([binds_start(entry) for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
@@ -114,9 +115,9 @@ def is_shortest_step(
     `time`, the larger one of the time itself and the length of the first step. Time alone would not
     do, because many solves start at zero, beside which every step is long.
     """
-    size, eps = jnp.abs(candidate), lambda x: float(jnp.finfo(jnp.result_type(x)).eps)
-    at_rest = jnp.all(change <= ROUNDOFF * eps(size) * size)
-    return at_rest | (jnp.abs(length) <= ROUNDOFF * eps(length) * time)
+    size = jnp.abs(candidate)
+    at_rest = jnp.all(change <= ROUNDOFF * eps_of(size) * size)
+    return at_rest | (jnp.abs(length) <= ROUNDOFF * eps_of(length) * time)
 
 
 def masked_step(

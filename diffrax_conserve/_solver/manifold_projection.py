@@ -25,7 +25,7 @@ from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._time import FieldTime
-from .._tree import ravel, tree_add, unravel, without_pattern
+from .._tree import eps_of, ravel, tree_add, unravel, without_pattern
 from .failure import (
     binds_start,
     error_for_controller,
@@ -379,7 +379,7 @@ class ManifoldProjection(ForwardingSolver):
         # XLA may add in another order, so we compare up to roundoff. A state that is NaN, for which
         # the comparison is false, has failed already.
         checksum, size = _checksum(step.y0)
-        roundoff = ROUNDOFF * float(jnp.finfo(size.dtype).eps) * size
+        roundoff = ROUNDOFF * eps_of(size) * size
         starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
         problem = target.problem(step.t0, step.y0)
         off = lax.cond(

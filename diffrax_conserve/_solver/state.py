@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._manifold import conserved_values
 from .._numerics.roundoff import cancellation_scale
-from .._tree import ravel, real_view, unflatten
+from .._tree import eps_of, ravel, real_view, unflatten
 from .statistics import ProjectionStatistics
 
 
@@ -80,7 +80,7 @@ def updated_units(
     size = largest_of_quantity(jnp.maximum(jnp.abs(end), change), like)
     change = largest_of_quantity(change, like)
     share = change / jnp.where(size > 0, size, 1)
-    share = jnp.maximum(share, float(jnp.finfo(change.dtype).eps))
+    share = jnp.maximum(share, eps_of(change))
     return jnp.maximum(units, size * jnp.sqrt(share))
 
 

@@ -18,6 +18,7 @@ from .._manifold import check_manifold, check_vector_field
 from .._options import one_of
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.unrolled import RK4
+from .._tree import eps_of
 from ._networks.flat import (
     as_states,
     check_scalars,
@@ -237,7 +238,7 @@ def _exact(term: Any, y0s: Any, h: Array, args: Args) -> Any:
 
 
 def _reference(term: Any, y0: Any, h: Array, args: Args, units: Any) -> Any:
-    eps = float(jnp.finfo(h.dtype).eps)
+    eps = eps_of(h)
 
     def norm(error: Any) -> Array:
         scaled = jtu.tree_map(lambda e, u: jnp.max(jnp.abs(e), initial=0) / u, error, units)

@@ -12,6 +12,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._custom_types import RealScalarLike
+from .._tree import eps_of
 
 
 def assert_gradients(
@@ -80,7 +81,7 @@ def assert_gradients(
     by_reverse = pullback(x) if reverse else jnp.zeros_like(x)
     pushforward = jax.jit(lambda x, v: jax.jvp(value, (x,), (v,))[1])
     direction = rng.normal(size=x.shape)
-    eps = float(jnp.finfo(x.dtype).eps)
+    eps = eps_of(x)
     relative = eps**0.5 if rtol is None else float(rtol)
     floor = relative * float(jnp.max(jnp.abs(output), initial=0)) if atol is None else float(atol)
     lines = []

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .._custom_types import Args, RealScalarLike, Y
-from .._tree import ravel, tree_sub
+from .._tree import eps_of, ravel, tree_sub
 
 _REFINEMENTS = np.array([1, 2, 3, 4, 6])
 # Errors below this many units of roundoff of the state are dominated by roundoff.
@@ -88,7 +88,7 @@ def assert_order(
             f"A solve did not succeed (its error is NaN):\n{table}\n"
             "To look at: a smaller `dt0`; whether the solver works with fixed steps."
         )
-    eps = max(float(jnp.finfo(jnp.result_type(x)).eps) for x in jtu.tree_leaves(reference))
+    eps = max(eps_of(jnp.result_type(x)) for x in jtu.tree_leaves(reference))
     used = errors > _FLOOR * eps * _largest(reference)
     if np.sum(used) < 2:
         raise ValueError(

@@ -12,7 +12,7 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._hashable import Hashable
 from ..._solver.diffrax_private import member, register
 from ..._solver.terms import in_field_time
-from ..._tree import tree_sub
+from ..._tree import eps_of, tree_sub
 from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
 from .chebyshev import ChebyshevInterpolation, series
@@ -79,7 +79,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
         check_output(self.pinn, (t0,), y0, "pinn")
         _, time = in_field_time(terms, t0)
         state = self.pinn(time)
-        tolerance = float(jnp.finfo(working_dtype(y0)).eps) ** 0.5
+        tolerance = eps_of(working_dtype(y0)) ** 0.5
         size = jnp.maximum(self.pinn.scale, jnp.abs(flatten(state)))
         starts = jnp.all(jnp.abs(flatten(tree_sub(y0, state))) <= tolerance * size)
         return jnp.where(self._covers(time), jnp.where(starts, 0, _ANOTHER_START), _OUTSIDE)

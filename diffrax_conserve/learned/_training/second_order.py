@@ -21,6 +21,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
 from ..._custom_types import RealScalarLike
+from ..._tree import eps_of
 
 # A function from the squared norm of the defect at each point, and a typical squared norm of `f`,
 # to a loss.
@@ -111,7 +112,7 @@ def _by_gram_matrix(matrix: Array, rhs: Array, damping: Array) -> Array:
     gram = matrix.T @ matrix if tall else matrix @ matrix.T
     # Roundoff in the Gram matrix is proportional to its largest eigenvalue. A damping below it does
     # not keep the matrix positive definite.
-    damping = jnp.maximum(damping, float(jnp.finfo(gram.dtype).eps) * jnp.trace(gram))
+    damping = jnp.maximum(damping, eps_of(gram) * jnp.trace(gram))
     factor = jsl.cho_factor(gram + damping * jnp.eye(gram.shape[0], dtype=gram.dtype), lower=True)
     if tall:
         return jsl.cho_solve(factor, matrix.T @ rhs)
@@ -123,7 +124,7 @@ def _by_triangular_factor(matrix: Array, rhs: Array, damping: Array) -> Array:
     largest, and needs a damping above it."""
     # Less damping amplifies the roundoff in `b`. On predators and prey the error was 1e-5 with a
     # hundred times as much or with none, and 3e-6 with this.
-    least = 0.01 * float(jnp.finfo(matrix.dtype).eps) * jnp.sum(jnp.square(matrix))
+    least = 0.01 * eps_of(matrix) * jnp.sum(jnp.square(matrix))
     damping = jnp.maximum(damping, least)
     rows, columns = matrix.shape
     if rows > columns:
