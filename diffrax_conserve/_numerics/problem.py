@@ -226,11 +226,6 @@ class Problem(eqx.Module):
         )
 
 
-def component_changes(start: Float[Array, " n"], end: Float[Array, " n"]) -> Float[Array, " n"]:
-    """How far each component moves from one state to another."""
-    return jnp.abs(end - start)
-
-
 def step_norm(
     start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
 ) -> Float[Array, ""]:

@@ -18,7 +18,7 @@ from .._interpolation import MakeManifoldInterpolation, Packed
 from .._manifold import Constraint, check_manifold, named_entries
 from .._numerics.iterate import any_lane
 from .._numerics.metric import Diagonal, Identity
-from .._numerics.problem import Step, component_changes, step_norm
+from .._numerics.problem import Step, step_norm
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
@@ -312,7 +312,7 @@ class ManifoldProjection(ForwardingSolver):
         that must not depend on the path.
         """
         step, candidate, displacements = wrapped.step, wrapped.candidate, state.displacements
-        changes = component_changes(step.y0, candidate)
+        changes = jnp.abs(candidate - step.y0)
         units = updated_units(state.units, changes, candidate, like)
         if displacements is not None:
             new = displacements_along(wrapped.path, step)
