@@ -11,11 +11,13 @@ from typing import Any, final
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Inexact
+from jaxtyping import Array, Bool, Float, Inexact
 
 from .._custom_types import Args, RealScalarLike, Values
+from .._numerics.iterate import any_lane
 from .._options import calling, check_function
 from .._tree import eps_of
 from .closed_form import ClosedForm
@@ -172,6 +174,10 @@ def _dagger(x: Array) -> Array:
     return jnp.conj(jnp.swapaxes(x, -1, -2))
 
 
+def _trace(x: Array) -> Array:
+    return jnp.trace(x, axis1=-2, axis2=-1).real[..., None, None]
+
+
 def _hermitian(x: Array) -> Array:
     return (x + _dagger(x)) / 2
 
@@ -181,11 +187,45 @@ _product = ft.partial(jnp.matmul, precision="highest")
 
 @jax.custom_jvp
 def _density_matrix(x: Matrices) -> Matrices:
-    return _spectral(x)[0]
+    shifted, is_positive = _of_trace_one(x)
+    return _where_positive(is_positive, shifted, lambda: _spectral(x)[0])
 
 
 @_density_matrix.defjvp
 def _density_matrix_jvp(primals: Any, tangents: Any) -> Any:
+    (x,), (change,) = primals, tangents
+    shifted, is_positive = _of_trace_one(x)
+    change = _hermitian(change)
+    # The trace stays one, by the same change of all eigenvalues.
+    quick = shifted, change - _trace(change) / x.shape[-1] * jnp.eye(x.shape[-1], dtype=x.dtype)
+    return _where_positive(is_positive, quick, lambda: _spectral_jvp(x, change))
+
+
+def _of_trace_one(x: Matrices) -> tuple[Matrices, Bool[Array, "*batch"]]:
+    """The Hermitian part, shifted by a multiple of one to the trace one, and whether all of its
+    eigenvalues are above the bound. Then it is the nearest density matrix. An eigendecomposition
+    takes many times as long as the test, a Cholesky decomposition."""
+    _check_square(x)
+    one = jnp.eye(x.shape[-1], dtype=x.dtype)
+    x = _hermitian(x)
+    x = x - (_trace(x) - 1) / x.shape[-1] * one
+    above = jnp.linalg.cholesky(x - 2 * _least(x) * one, symmetrize_input=False)
+    is_positive = jnp.all(jnp.isfinite(above), axis=(-2, -1))
+    return _exactly(x), lax.stop_gradient(is_positive)
+
+
+def _where_positive(is_positive: Bool[Array, "*batch"], quick: Any, slow: Callable[[], Any]) -> Any:
+    """What is `quick`, and for the matrices with an eigenvalue below the bound what `slow()`
+    returns, which is skipped if no matrix needs it."""
+
+    def chosen() -> Any:
+        where = lambda a, b: jnp.where(is_positive[..., None, None], a, b)  # noqa: E731
+        return jtu.tree_map(where, quick, slow())
+
+    return lax.cond(any_lane(~jnp.all(is_positive)), chosen, lambda: quick)
+
+
+def _spectral_jvp(x: Matrices, t_x: Matrices) -> tuple[Array, Array]:
     """The derivative of a function of a Hermitian matrix (the theorem of Daleckii and Krein;
     Higham, Theorem 3.11): in the basis of its eigenvectors each element of the tangent is
     multiplied by the divided difference `(p_i - p_j) / (w_i - w_j)` of the eigenvalues before (`w`)
@@ -195,8 +235,8 @@ def _density_matrix_jvp(primals: Any, tangents: Any) -> Any:
     the bound, also where they coincide, and zero where neither is. At last `μ` changes such that
     the trace stays one, by the same amount for all eigenvalues above the bound.
     """
-    y, v, w, p, positive = _spectral(primals[0])
-    change = _product(_dagger(v), _product(_hermitian(tangents[0]), v))
+    y, v, w, p, positive = _spectral(x)
+    change = _product(_dagger(v), _product(t_x, v))
     both = positive[..., :, None] & positive[..., None, :]
     mixed = positive[..., :, None] != positive[..., None, :]
     gap = jnp.where(mixed, w[..., :, None] - w[..., None, :], 1)
@@ -204,35 +244,37 @@ def _density_matrix_jvp(primals: Any, tangents: Any) -> Any:
     quotient = jnp.where(mixed, (p[..., :, None] - p[..., None, :]) / gap, both.astype(p.dtype))
     change = quotient * change
     share = positive / jnp.sum(positive, axis=-1, keepdims=True)
-    trace = jnp.trace(change, axis1=-2, axis2=-1)
-    change = change - trace[..., None, None] * share[..., None, :] * jnp.eye(
-        p.shape[-1], dtype=p.dtype
-    )
+    change = change - _trace(change) * share[..., None, :] * jnp.eye(p.shape[-1], dtype=p.dtype)
     return y, _product(v, _product(change, _dagger(v)))
 
 
 def _spectral(x: Matrices) -> tuple[Array, Array, Array, Array, Array]:
     """The density matrix; the eigenvectors; the eigenvalues before and after; and which of them are
     above the bound."""
-    _check_square(x)
     w, v = jnp.linalg.eigh(_hermitian(x), symmetrize_input=False)
-    n = w.shape[-1]
-    least = 2 * n * eps_of(w)
-    p, positive = _onto_simplex(w, least)
+    p, positive = _onto_simplex(w, _least(x))
     root = v * jnp.sqrt(p)[..., None, :]
+    return _exactly(_product(root, _dagger(root))), v, w, p, positive
+
+
+def _least(x: Matrices) -> float:
+    """The least eigenvalue."""
+    return 2 * x.shape[-1] * eps_of(x)
+
+
+def _exactly(y: Matrices) -> Matrices:
+    """The matrix, Hermitian and of trace one to roundoff, without that roundoff."""
     # The upper triangle is made from the lower one. Half the sum of the matrix and its adjoint
     # would be Hermitian too, but a compiler may round the two sums for a pair of elements
     # differently.
-    y = _product(root, _dagger(root))
     lower = jnp.tril(y, -1)
     diagonal = jnp.diagonal(y, axis1=-2, axis2=-1).real
     # What rounding added to the trace is taken from the largest element of the diagonal, of which
     # it is the smallest share.
-    largest = jnp.arange(n) == jnp.argmax(diagonal, axis=-1)[..., None]
+    largest = jnp.arange(y.shape[-1]) == jnp.argmax(diagonal, axis=-1)[..., None]
     excess = jnp.sum(diagonal, axis=-1, keepdims=True) - 1
     diagonal = diagonal - jnp.where(largest, excess, 0)
-    y = lower + _dagger(lower) + (diagonal[..., None] * jnp.eye(n, dtype=w.dtype)).astype(y.dtype)
-    return y, v, w, p, positive
+    return lower + _dagger(lower) + diagonal[..., None] * jnp.eye(y.shape[-1], dtype=y.dtype)
 
 
 def _onto_simplex(w: Float[Array, "*batch n"], least: float) -> tuple[Array, Array]:

@@ -80,6 +80,21 @@ def test_large_matrices_have_positive_density_matrices_too():
     np.testing.assert_allclose(project(y), y, rtol=0, atol=8 * EPS)
 
 
+def test_of_a_positive_matrix_the_trace_is_shifted_whatever_is_beside_it():
+    """Without eigenvalues: those of the other matrix of the batch are needed."""
+    project, x = FORMULAS["density"]
+    root = matrices(7, 4, 4, kind=complex)
+    positive = root @ root.conj().T + np.eye(4)
+    mixed = positive / np.trace(positive) * 1.01
+    for given in (mixed, mixed + 1e-9 * root):
+        hermitian = (given + given.conj().T) / 2
+        want = hermitian + (1 - np.trace(hermitian).real) / 4 * np.eye(4)
+        np.testing.assert_allclose(project(given), want, rtol=0, atol=2 * EPS)
+        both = jax.vmap(project)(np.stack([given, x]))
+        np.testing.assert_array_equal(both[0], project(given))
+        np.testing.assert_array_equal(both[1], project(x))
+
+
 Z, X = np.diag([1.0 + 0j, -1]), np.array([[0j, 1], [1, 0]])
 DOWN = np.array([[0j, 1], [0, 0]])
 

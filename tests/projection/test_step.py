@@ -175,9 +175,7 @@ def test_a_projection_sees_the_step_of_every_candidate():
 
 class Unseeing(Seen):
     sees_step: ClassVar[bool] = False
-    follows_gradients: ClassVar[bool] = (
-        True  # with `max_steps` of the base class
-    )
+    follows_gradients: ClassVar[bool] = True  # with `max_steps` of the base class
 
     def solve(self, problem, candidate):
         assert problem.step is None
