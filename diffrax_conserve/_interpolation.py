@@ -64,9 +64,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     - `t0`, `t1`: the ends of the step, as times of the solver.
     - `inner`: the interpolant `u` of the wrapped solver.
     - `field_time`: the time of the vector field as a function of that of the solver, and back.
-    - `shift`: the correction of the step, `y₁ - ŷ₁`.
-    - `limit`: the length of the step in the metric, which a correction may exceed only if the moved
-      interpolant is farther than this from the state at the start of the step.
+    - `step_correction`: the correction of the step, `y₁ - ŷ₁`.
+    - `step_norm`: the norm of the step in the metric. A correction may be as long as it, or as the
+      distance of the moved interpolant from the start of the step.
     - `error`: the error estimate of the step, if the projection uses it.
     - `target`: what the projection of the step aimed at, without the balances of the step itself.
     """
@@ -75,8 +75,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     inner: dfx.AbstractLocalInterpolation
     field_time: FieldTime
-    shift: Float[Array, " n"]
-    limit: Float[Array, ""]
+    step_correction: Float[Array, " n"]
+    step_norm: Float[Array, ""]
     error: Float[Array, " n"] | None
     target: Packed
 
@@ -91,7 +91,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         t = jnp.where(t0 < y_start, y_start, jnp.where(t0 > last, last, t0))
         u = self.inner.evaluate(t, left=left)
         share = (t - self.t0) / nonzero_length(self.t0, self.t1)
-        moved = ravel(u) + share.astype(self.shift.dtype) * self.shift
+        moved = ravel(u) + share.astype(self.step_correction.dtype) * self.step_correction
         return unravel(self.projected(self.field_time(t), moved), u)
 
     def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -103,11 +103,11 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         problem = target.problem(t, candidate, step)
         metric, projection = problem.factor, target.projection
         distance = metric.norm(candidate - y_start)
-        limit = lax.stop_gradient(jnp.maximum(self.limit, distance))
+        longest = lax.stop_gradient(jnp.maximum(self.step_norm, distance))
 
         def is_accepted(y: Array, ok: Array) -> Array:
             """Whether a projection succeeded without leading too far away."""
-            return ok & (metric.norm(y - candidate) <= limit)
+            return ok & (metric.norm(y - candidate) <= longest)
 
         y, info = projection.solve(problem, candidate)
         ok = is_accepted(y, info.ok)

@@ -87,7 +87,7 @@ def key_of(entry: Any) -> Any:
     return getattr(entry, "key", getattr(entry, "idx", getattr(entry, "name", None)))
 
 
-def without_pattern(n: int, dtype: Any) -> Array:
+def irregular_weights(n: int, dtype: Any) -> Array:
     """The sines of 1, 4, 9, ..., in which there is no pattern: as a direction they are in general
     position, and the same in every call."""
     return jnp.asarray(np.sin(np.arange(1, n + 1, dtype=float) ** 2), dtype)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._constants import OPERATIONS
+from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
 from diffrax_conserve._fast.jaxprs import jaxprs_inside
-from diffrax_conserve._fast.scalars import components, in_scalars, written_out
+from diffrax_conserve._fast.scalars import components, scalarised, scalarised_result
 
 from .problems import INERTIA, printed, rotational_energy, squared_momentum
 from .thinned import some_of
@@ -120,10 +120,10 @@ def with_jacobian(fn):
 def test_a_form_is_written_out(name):
     fn, arrays = FORMS[name]
     y = jnp.array([0.3, 0.5, 0.7])
-    written = in_scalars(fn, y)
+    written = scalarised(fn, y)
     assert names_of_arrays(jax.make_jaxpr(written)(components(y)).jaxpr) == set(arrays.split())
     if not arrays:
-        written = in_scalars(with_jacobian(fn), y)
+        written = scalarised(with_jacobian(fn), y)
         closed = jax.make_jaxpr(written)(components(y))
         assert not [v for e in equations_in(closed.jaxpr) for v in e.outvars if v.aval.ndim]
 
@@ -135,8 +135,8 @@ def test_a_form_that_is_written_out_keeps_its_values_and_derivatives(name):
 
     def found(y):
         values, jacobian = with_jacobian(fn)(y)
-        inside = written_out(with_jacobian(fn), y)
-        around = jax.jacrev(lambda y: written_out(fn, y))(y)
+        inside = scalarised_result(with_jacobian(fn), y)
+        around = jax.jacrev(lambda y: scalarised_result(fn, y))(y)
         return (values, jacobian, jacobian), (*inside, around)
 
     for dtype in (jnp.float64, jnp.float32):
@@ -160,10 +160,10 @@ own_transpose.defvjp(lambda x: (x, None), lambda _, g: (7 * g,))
 
 @pytest.mark.parametrize("fn", [own_derivative, own_transpose])
 def test_a_derivative_of_ones_own_is_kept(fn):
-    gradient = jax.grad(lambda y: jnp.sum(written_out(lambda y: 2 * fn(y), y)))(jnp.ones(3))
+    gradient = jax.grad(lambda y: jnp.sum(scalarised_result(lambda y: 2 * fn(y), y)))(jnp.ones(3))
     np.testing.assert_array_equal(gradient, 14 * np.ones(3))
     # Where no derivative is taken afterwards it is written out.
-    written = in_scalars(with_jacobian(fn), jnp.ones(3))
+    written = scalarised(with_jacobian(fn), jnp.ones(3))
     assert not names_of_arrays(jax.make_jaxpr(written)(components(jnp.ones(3))).jaxpr)
 
 
@@ -172,10 +172,10 @@ def test_what_is_too_large_has_an_effect_or_random_numbers_is_not_written_out():
         jax.debug.print("{}", y)
         return y
 
-    assert in_scalars(lambda y: y + 1, jnp.ones(OPERATIONS // 2)) is not None
-    assert in_scalars(lambda y: y + y + 1, jnp.ones(OPERATIONS)) is None
-    assert in_scalars(prints, jnp.ones(3)) is None
-    assert in_scalars(lambda y: y + jr.normal(jr.key(0)), jnp.ones(3)) is None
+    assert scalarised(lambda y: y + 1, jnp.ones(MAX_SCALAR_OPERATIONS // 2)) is not None
+    assert scalarised(lambda y: y + y + 1, jnp.ones(MAX_SCALAR_OPERATIONS)) is None
+    assert scalarised(prints, jnp.ones(3)) is None
+    assert scalarised(lambda y: y + jr.normal(jr.key(0)), jnp.ones(3)) is None
 
 
 LANES = 7

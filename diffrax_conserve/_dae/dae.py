@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._constants import LEAST_KLU
+from .._constants import MIN_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
 from .._large.klu import sparse_jacobian
@@ -395,7 +395,7 @@ class DAE(Hashable):
             if self.algebraic is not None:
                 g = ravel(values["algebraic"]).astype(vector.dtype)
                 return jnp.concatenate([slopes[: f.size] - f, g])
-            if matrix is not None and size >= LEAST_KLU:
+            if matrix is not None and size >= MIN_KLU:
                 return matrix @ slopes - f
             mass = self.mass(t, state, args) if matrix is None else matrix.matrix.toarray()
             return jnp.asarray(mass, vector.dtype) @ slopes - f
@@ -689,7 +689,7 @@ def _solved_for(
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
     residual = reduction.small(residual, y[free])
-    is_large = structure.large is not None and free.size >= LEAST_KLU
+    is_large = structure.large is not None and free.size >= MIN_KLU
     jacobian = sparse_jacobian(residual, y[free]) if is_large else None
     if jacobian is None:
         found = root(residual, ft.partial(newton, residual), y[free], divided)

@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 from .._constants import REGULARISATION_POWER
 from .._fast.scalars import small
 from .._numerics.implicit import root
-from .._tree import eps_of, without_pattern
+from .._tree import eps_of, irregular_weights
 from .large import Large
 from .newton import SparseNewton, algebraic_newton, divided
 
@@ -404,7 +404,7 @@ def _near(
 
 def general_states(t: Array, y: Array, share: float) -> tuple[Array, Array, Array]:
     """A time and a state at this relative distance, and two slopes."""
-    pattern = without_pattern(3 * y.size + 1, y.dtype)
+    pattern = irregular_weights(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
     size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
     moved = y + share * size * (1 + pattern[: y.size] / 2)

@@ -35,7 +35,7 @@ from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import AbstractRows
 from .._options import ONE_STATE, check_function, one_of
 from .._printing import printed
-from .._tree import eps_of, key_of, ravel, unravel, without_pattern
+from .._tree import eps_of, irregular_weights, key_of, ravel, unravel
 
 Entry = FirstIntegral | Constraint
 
@@ -261,7 +261,7 @@ def _relative_sizes(
     # size of the others.
     sizes = jnp.abs(vector)
     sizes = _BESIDE * jnp.where(sizes == 0, jnp.max(sizes, initial=0), sizes)
-    beside = vector + sizes * without_pattern(vector.size, dtype)
+    beside = vector + sizes * irregular_weights(vector.size, dtype)
     idle = (terms == 0) & (terms_at(beside, problem.linearise(beside)[1]) > 0)
     # Forces may cancel inside the field, so that its value is less accurate than its size tells. If
     # that roundoff is much larger than the terms, the defect is relative to it.

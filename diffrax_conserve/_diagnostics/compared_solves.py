@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._custom_types import Args, RealScalarLike, Values
 from .._manifold import Constraint, FirstIntegral, slope_of
-from .._tree import ravel, unravel, without_pattern
+from .._tree import irregular_weights, ravel, unravel
 from .drift import drift
 
 # The tolerances of the two solves that are the reference, in units of the largest values of the
@@ -138,7 +138,7 @@ def _varied(task: Task, ts: Array, ys: Any) -> Any:
 
     def at(t: Array, y: Any) -> Any:
         x = ravel(y)
-        share = _VARIED * without_pattern(x.size, x.dtype)
+        share = _VARIED * irregular_weights(x.size, x.dtype)
         more, less = (
             slope_of(task.term.vector_field, t, unravel(x * (1 + s), y), task.args)
             for s in (share, -share)

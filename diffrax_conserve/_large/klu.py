@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
-from .._tree import eps_of, without_pattern
+from .._tree import eps_of, irregular_weights
 from .asdex_import import asdex
 from .detection import constants_of, content_key, jacobian_places
 
@@ -137,7 +137,7 @@ class Places:
         heights = jnp.where(heights == 0, 1, heights)[self.rows]
         widths = jax.ops.segment_max(sizes / heights, self.columns, self.size)
         widths = jnp.where(widths == 0, 1, widths)[self.columns]
-        pattern = without_pattern(len(self.numbers) + self.size, values.dtype)
+        pattern = irregular_weights(len(self.numbers) + self.size, values.dtype)
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
         scaled = values / heights / widths + _TINY * 1j * shift
         x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))

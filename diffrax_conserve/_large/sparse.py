@@ -30,10 +30,10 @@ from jaxtyping import Array, Float
 
 from .._constants import (
     DENSE_ROW_RATIO,
-    LEAST_SPARSE,
     MAX_BLOCK,
     MAX_DENSE_ROWS,
     MAX_DENSE_SYSTEM,
+    MIN_SPARSE,
 )
 from .asdex_import import asdex, reason
 from .detection import constants_of, content_key, jacobian_places
@@ -216,7 +216,7 @@ def pattern_of(
     """The pattern of the Jacobian of these functions; `None` if they are few, or if it is not
     sparse or cannot be found."""
     m, n = sum(sizes), y.size
-    if m < LEAST_SPARSE:
+    if m < MIN_SPARSE:
         return None
     try:
         asdex()

@@ -20,7 +20,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._constants import MAX_STEPS, WRITTEN_OUT
+from .._constants import MAX_STEPS, MAX_UNROLLED
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
 from .._interpolation import Packed
@@ -354,7 +354,7 @@ def _shake(
         causes as the right side, which has no contradiction. For up to four constraints the
         solution has no such part."""
         x = solve(g)
-        return x if len(g) <= WRITTEN_OUT else solve(at.jacobian.matvec(moves(x)))
+        return x if len(g) <= MAX_UNROLLED else solve(at.jacobian.matvec(moves(x)))
 
     def advance(x: Array, tests_left: Array) -> tuple[Array, Array]:
         g = _barrier(problem.residual(_barrier(position(x))))

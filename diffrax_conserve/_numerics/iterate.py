@@ -31,8 +31,14 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import AT_BOUND, BACKTRACKING_FACTOR, FROZEN_STEPS, ROUNDOFF, WRITTEN_OUT
-from .._fast.scalars import alone_or_in_lanes, joined, written_out_loop
+from .._constants import (
+    BACKTRACKING_FACTOR,
+    FROZEN_STEPS,
+    MAX_UNROLLED,
+    ROUNDOFF,
+    SLOPE_BEYOND_BOUNDS,
+)
+from .._fast.scalars import alone_or_batched, joined, scalarised_loop
 from .linear import permuted, pivot_order, roundoff_pivot_tolerance
 from .problem import (
     ABOVE_TOLERANCE,
@@ -161,9 +167,9 @@ def simplified_newton(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     For up to four constraints, `directions` takes their place; without `directions`, the rows are
     the gradients at the current state after `FROZEN_STEPS` iterations."""
-    if problem.magnitude.size > WRITTEN_OUT:
+    if problem.magnitude.size > MAX_UNROLLED:
         return _with_frozen_jacobian(problem, candidate, max_steps)
-    return alone_or_in_lanes(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
+    return alone_or_batched(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
         (problem, candidate, directions)
     )
 
@@ -216,7 +222,7 @@ def _with_fresh_jacobians(given: Any, lanes: bool, *, max_steps: int) -> Solved:
 
     if lanes:
         tests_left = initial_tests(max_steps)
-        found, step, y = written_out_loop(loop_invariants, advance, candidate, tests_left)
+        found, step, y = scalarised_loop(loop_invariants, advance, candidate, tests_left)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
@@ -357,9 +363,9 @@ def _line_search(
         return jnp.where(descends, middle, ends[0]), jnp.where(descends, ends[1], middle)
 
     # A full step is kept if it goes hardly past the minimum. If all components that it moves are
-    # beyond their bounds, where `clip` has the derivative `AT_BOUND`, the step is far too long.
+    # beyond their bounds, where `clip` has a tiny derivative, the step is far too long.
     ends = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
-    in_full = (descent(1.0) >= -(AT_BOUND**0.5) * descent(0.0)) | ~goes_on
-    bisected = lambda: lax.fori_loop(0, round(-math.log2(AT_BOUND)), halve, ends)[1]  # noqa: E731
+    in_full = (descent(1.0) >= -(SLOPE_BEYOND_BOUNDS**0.5) * descent(0.0)) | ~goes_on
+    bisected = lambda: lax.fori_loop(0, round(-math.log2(SLOPE_BEYOND_BOUNDS)), halve, ends)[1]  # noqa: E731
     step_fraction = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
     return jnp.where(in_full, ends[1], step_fraction)

@@ -99,33 +99,33 @@ class Diagonal(AbstractFactor):
 
 
 @final
-class Matrices(AbstractFactor):
+class BlockCholesky(AbstractFactor):
     """The factor of a metric that is a matrix in some parts of the state. In such a part
     `M = L Lᵀ` is the Cholesky factorisation, and `S = L⁻ᵀ`; elsewhere `S` is diagonal.
 
-    - `elsewhere`: the diagonal, ones in the parts with a matrix.
+    - `diagonal_elsewhere`: the diagonal, ones in the parts with a matrix.
     - `lower`: the factor `L` of each part with a matrix.
     - `starts`: the first component of each of these parts.
     """
 
-    elsewhere: Diagonal
+    diagonal_elsewhere: Diagonal
     lower: tuple[Float[Array, "k k"], ...]
     starts: tuple[int, ...] = eqx.field(static=True)
     is_dense: ClassVar[bool] = True
 
     def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
-        return self._in_parts(solve, self.elsewhere.scale_gradient(gradient))
+        return self._on_blocks(solve, self.diagonal_elsewhere.scale_gradient(gradient))
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
-        return self._in_parts(solve, self.elsewhere.to_state(change))
+        return self._on_blocks(solve, self.diagonal_elsewhere.to_state(change))
 
     def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
-        return self._in_parts(product, self.elsewhere.to_metric(change))
+        return self._on_blocks(product, self.diagonal_elsewhere.to_metric(change))
 
-    def _in_parts(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
+    def _on_blocks(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
         """`x` with `fn(L, part)` in the place of each part with a matrix."""
         for start, lower in zip(self.starts, self.lower, strict=True):
             part = slice(start, start + len(lower))
@@ -259,7 +259,7 @@ def factor_of(metric: PyTree[Any], t: RealScalarLike, y: Y, args: Args) -> Abstr
     if not matrices:
         return Diagonal(units)
     lower = (jnp.linalg.cholesky(jnp.asarray(x, units.dtype)) for x in matrices.values())
-    return Matrices(Diagonal(units), tuple(lower), tuple(matrices))
+    return BlockCholesky(Diagonal(units), tuple(lower), tuple(matrices))
 
 
 def broadcast_option(name: str, option: PyTree[ArrayLike], like: Any) -> Float[Array, " n"]:

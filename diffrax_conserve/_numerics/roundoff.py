@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._constants import LEAST_SPARSE
+from .._constants import MIN_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import pattern_of
@@ -83,7 +83,7 @@ def cancellation_scale(
         # The roundoff of an entry with many elements is not measured, because that would cost a
         # reverse pass for each.
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
-        few = [size < LEAST_SPARSE for size in sizes]
+        few = [size < MIN_SPARSE for size in sizes]
         measured = [
             cancellation_terms(fn, vector)[2] if one else jnp.zeros(size, vector.dtype)
             for fn, size, one in zip(functions, sizes, few, strict=True)

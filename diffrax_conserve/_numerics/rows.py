@@ -32,7 +32,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_BLOCK, REGULARISATION_POWER, WRITTEN_OUT
+from .._constants import MAX_BLOCK, MAX_UNROLLED, REGULARISATION_POWER
 from .._tree import eps_of
 from .linear import (
     Solve,
@@ -172,7 +172,7 @@ class DenseRows(AbstractRows):
         return _transposed_product(multiplier, self.matrix)
 
     def gram(self, others: "DenseRows") -> "PivotedGram | RegularisedGram":
-        if len(self) > WRITTEN_OUT:
+        if len(self) > MAX_UNROLLED:
             product = jnp.matmul(self.matrix, others.matrix.T, precision=lax.Precision.HIGHEST)
             return RegularisedGram(product)
         return PivotedGram(jnp.sum(self.matrix[:, None, :] * others.matrix[None], axis=2))
@@ -304,14 +304,14 @@ def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"
 
 def _transposed_product(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
     """`rowsᵀ x`. A short sum is written out, so that XLA fuses it with what is around it."""
-    if len(rows) > WRITTEN_OUT:
+    if len(rows) > MAX_UNROLLED:
         return jnp.matmul(x, rows, precision=lax.Precision.HIGHEST)
     return jnp.sum(x[:, None] * rows, axis=0)
 
 
 def solve_dense(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """`matrix⁻¹ b`."""
-    return (PivotedGram(matrix) if len(b) <= WRITTEN_OUT else RegularisedGram(matrix)).solve(b)
+    return (PivotedGram(matrix) if len(b) <= MAX_UNROLLED else RegularisedGram(matrix)).solve(b)
 
 
 def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:

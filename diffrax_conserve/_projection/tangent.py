@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from .._balance import rates
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._fast.scalars import written_out
+from .._fast.scalars import scalarised_result
 from .._manifold import (
     LieDerivative,
     check_manifold,
@@ -172,5 +172,5 @@ class TangentField(eqx.Module):
             change = problem.factor.to_state(gram.row_space_correction(rows, right))
             return change, gram.solve(right) / sizes
 
-        correction, multiplier = written_out(solved, (vector, active))
+        correction, multiplier = scalarised_result(solved, (vector, active))
         return slope, unravel(correction, y), unflatten(multiplier, values)

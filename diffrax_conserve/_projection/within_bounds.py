@@ -20,7 +20,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
-from .._constants import AT_BOUND, MAX_STEPS
+from .._constants import MAX_STEPS, SLOPE_BEYOND_BOUNDS
 from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.iterate import Solved, projected_newton
 from .._numerics.metric import broadcast_option, positive_weights
@@ -43,7 +43,9 @@ class Bounds(eqx.Module):
         high = np.inf if upper is None else upper
         return cls(broadcast_option("lower", low, like), broadcast_option("upper", high, like))
 
-    def clip(self, z: Float[Array, " n"], *, slope: float = AT_BOUND) -> Float[Array, " n"]:
+    def clip(
+        self, z: Float[Array, " n"], *, slope: float = SLOPE_BEYOND_BOUNDS
+    ) -> Float[Array, " n"]:
         """`z` within the bounds, with the derivative `slope` where it is beyond them. A component
         exactly at its bound has the derivative one, that from inside, unlike in `jnp.clip`."""
         lower, upper = self.lower, self.upper

@@ -25,7 +25,7 @@ from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._time import FieldTime
-from .._tree import eps_of, ravel, tree_add, unravel, without_pattern
+from .._tree import eps_of, irregular_weights, ravel, tree_add, unravel
 from .failure import (
     binds_start,
     error_for_controller,
@@ -231,8 +231,8 @@ class ManifoldProjection(ForwardingSolver):
         dense_info = dict(
             inner=wrapped.dense_info,
             field_time=wrapped.field_time,
-            shift=y1 - candidate,
-            limit=step_norm(step.y0, y1, metric),
+            step_correction=y1 - candidate,
+            step_norm=step_norm(step.y0, y1, metric),
             error=step.error if self.projection.sees_step else None,
             target=Packed(start),
         )
@@ -392,7 +392,7 @@ class ManifoldProjection(ForwardingSolver):
 
 def _checksum(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """A weighted sum of the components, by which a state is recognised, and that of their sizes."""
-    terms = without_pattern(y.size, y.dtype) * y
+    terms = irregular_weights(y.size, y.dtype) * y
     return jnp.sum(terms), jnp.sum(jnp.abs(terms))
 
 

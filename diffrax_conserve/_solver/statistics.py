@@ -17,7 +17,7 @@ from .._printing import is_traced, names_at, printed
 # Corrections are usually shorter than the error estimate of their step, because that is the
 # estimate for a method of lower order. If one is longer by this factor, the quantity is probably
 # not conserved. The number is a choice.
-_SUSPICIOUS = 10
+_MAX_PLAUSIBLE = 10
 
 
 @final
@@ -72,7 +72,7 @@ class ProjectionStatistics(eqx.Module):
         if np.all(np.isnan(self.error)):
             del rows["error"]
         text = printed("projections of the accepted steps", rows)
-        suspicious = np.asarray(self.correction) > _SUSPICIOUS * np.asarray(self.error)
+        suspicious = np.asarray(self.correction) > _MAX_PLAUSIBLE * np.asarray(self.error)
         if not self.bounded and np.any(suspicious):
             text += (
                 "\nCorrections are far longer than the error estimates of the steps explain:"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
-from .._fast.scalars import written_out
+from .._fast.scalars import scalarised_result
 
 _HERMITE = dfx.ThirdOrderHermitePolynomialInterpolation
 
@@ -76,7 +76,7 @@ class _Explicit(dfx.AbstractSolver[None]):
         # faster only where each stage follows from the one before alone (`benchmarks/README.md`).
         chain = all(np.count_nonzero(row[:-1]) == 0 for row in tableau.a_lower)
         ends = lambda y0: advanced(y0)[:2]  # noqa: E731
-        y1, error = written_out(ends, y0) if chain else ends(y0)
+        y1, error = scalarised_result(ends, y0) if chain else ends(y0)
         dense_info = dict(y0=y0, y1=y1, k0=stage(0.0, y0), k1=stage(1.0, y1))
         return y1, error, dense_info, None, dfx.RESULTS.successful
 
