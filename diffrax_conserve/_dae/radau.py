@@ -169,50 +169,57 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         sizes = systems.sizes_of_terms(start, start / length)
         least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
-        real, pair = systems.solvers(_REAL / length, _PAIR / length)
-
-        def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-            """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
-            by the eigenvectors of `A⁻¹`."""
-            vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
-            modes = -to_modes @ residuals
-            first, second = real(modes[0].real), pair(modes[1])
-            other = 2 * (vectors[:, 1, None] * second).real
-            return vectors[:, 0, None].real * first + other
-
         finder, pair_dtype = self.root_finder, jnp.result_type(start, complex(0))
 
         def size(change: Array, y: Array) -> Array:
             scale = finder.atol + finder.rtol * jnp.abs(y)
             return finder.norm(jax.vmap(lambda x: unravel(x, y0))(change / scale))
 
-        def advance(now: Any, counter: Array) -> tuple[Any, Array]:
-            y, before = now
-            change = correction(seen(stages(y)))
-            new = y + change
-            now_size = size(change, new)
-            rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
-            # A change by the roundoff of the state cannot become smaller.
-            rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
-            settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-            return keep_done(counter, (new, now_size), now), after_step(settled, rate < 2, counter)
-
         def newton(guess: Array) -> Solved:
+            """The stages, and the error estimate."""
+            real, pair, freed = systems.solvers(_REAL / length, _PAIR / length)
+
+            def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+                """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the
+                stages, by the eigenvectors of `A⁻¹`."""
+                vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
+                modes = -to_modes @ residuals
+                first, second = real(modes[0].real), pair(modes[1])
+                other = 2 * (vectors[:, 1, None] * second).real
+                return vectors[:, 0, None].real * first + other
+
+            def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+                y, before = now
+                change = correction(seen(stages(y)))
+                new = y + change
+                now_size = size(change, new)
+                rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
+                # A change by the roundoff of the state cannot become smaller.
+                rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
+                settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
+                return keep_done(counter, (new, now_size), now), after_step(
+                    settled, rate < 2, counter
+                )
+
             begin = guess, jnp.asarray(jnp.inf, start.dtype)
             found = iterate(advance, begin, max_steps=self.root_find_max_steps)
-            return found._replace(y=found.y[0])
+            y = found.y[0]
+            slopes = -jnp.asarray(_ERROR, start.dtype) @ (y - start) / length
+
+            def filtered(y: Array, before: Array) -> Array:
+                # The solution waits for the one before, also if the equations contain no `y`.
+                known = jnp.all(jnp.isfinite(before))
+                return -real(jnp.where(known, seen(residual(t0, y, slopes)), jnp.nan))
+
+            first = filtered(start, y)
+            error = filtered(start + first, first)
+            y, error = freed(error, y, error)
+            return found._replace(y=y, more=error)
 
         found = root(stages, newton, guess, systems.stages_solution, systems.stages_jacobian)
-        y = found.y
+        y, error = found.y, found.more
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
-        # The error estimate.
-        slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
-
-        def filtered(y: Array) -> Array:
-            return -real(seen(residual(t0, y, slopes)))
-
-        error = filtered(start + filtered(start))
         ok = found.ok & jnp.all(jnp.isfinite(error))
         big = float(jnp.finfo(start.dtype).max) ** 0.5
         error = lax.stop_gradient(jnp.where(ok, error, big))

@@ -2,8 +2,9 @@
 
 KLU (T. A. Davis and E. Palamadai Natarajan, *Algorithm 907: KLU, a direct sparse solver for circuit
 simulation problems*, ACM Trans. Math. Softw. 37, 2010) orders the places of a matrix once, which is
-done while a solve is traced. A solve inside of `jit` then factors the values. No factor is kept,
-so that there is nothing to free, and lanes and threads do not disturb each other.
+done while a solve is traced. A solve inside of `jit` then factors the values, and keeps no factor, so
+that there is nothing to free, and lanes and threads do not disturb each other. Where several
+systems have the same matrix, `Factor` keeps its factor from the first to the last of them.
 
 KLU works on a CPU, with float64 and complex128. A pivot that is exactly zero raises an error that
 ends the program, so a matrix is tested before; see `Places.is_regular`.
@@ -12,13 +13,15 @@ ends the program, so a matrix is tested before; see `Places.is_regular`.
 import functools as ft
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
@@ -107,7 +110,7 @@ class Places:
     ) -> Shaped[Array, " n"]:
         """`A⁻¹ b`, of a matrix that is known to be regular, or has values that are NaN."""
         dtype = jnp.result_type(values, b)
-        if self._permutation is None:
+        if self.permutation is None:
             return jnp.full(b.shape, jnp.nan, dtype)
         values, b = values.astype(dtype), b.astype(dtype)
         return lax.custom_linear_solve(
@@ -125,43 +128,53 @@ class Places:
         element has a tiny imaginary part in general position: where real parts cancel exactly, the
         imaginary parts do not, and the pivot is tiny, but not zero. The real parts are the same.
         """
-        if self._permutation is None:
+        if self.permutation is None:
             return jnp.asarray(False)
         values = lax.stop_gradient(values)
         if jnp.iscomplexobj(values):
             real, imag = values.real, values.imag
             parts = jnp.concatenate([real, -imag, imag, real])
             return self._real_form[0].is_regular(parts[self._real_form[1]])
+        scaled, _, _, b = self.in_general_position(values)
+        return is_bounded(self._klu("solve_with_symbol", scaled, b))
+
+    def in_general_position(self, values: Float[Array, " k"]) -> tuple[Array, ...]:
+        """A real matrix with the tiny imaginary parts, in the units of its rows and columns; the
+        units; and the vector in general position."""
         sizes = jnp.abs(values)
         heights = jax.ops.segment_max(sizes, self.rows, self.size)
-        heights = jnp.where(heights == 0, 1, heights)[self.rows]
-        widths = jax.ops.segment_max(sizes / heights, self.columns, self.size)
-        widths = jnp.where(widths == 0, 1, widths)[self.columns]
+        heights = jnp.where(heights == 0, 1, heights)
+        scaled = values / heights[self.rows]
+        widths = jax.ops.segment_max(jnp.abs(scaled), self.columns, self.size)
+        widths = jnp.where(widths == 0, 1, widths)
         pattern = without_pattern(len(self.numbers) + self.size, values.dtype)
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
-        scaled = values / heights / widths + _TINY * 1j * shift
-        x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))
-        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(values.dtype).eps)))
+        scaled = scaled / widths[self.columns] + _TINY * 1j * shift
+        return scaled, heights, widths, b.astype(scaled.dtype)
+
+    def finite(self, values: Array) -> tuple[Array, Bool[Array, ""]]:
+        """The values, and whether all are finite. With a matrix that is not finite KLU may find no
+        pivot, so it gets a permutation instead."""
+        finite = jnp.all(jnp.isfinite(values))
+        return jnp.where(finite, values, jnp.asarray(self.permutation, values.dtype)), finite
 
     def _klu(self, name: str, values: Array, b: Array) -> Array:
         """Calls KLU; `b` may have several columns. The primitives are bound themselves, because the
-        functions of klujax sort the places in each program anew. With a matrix that is not finite
-        KLU may find no pivot, so it gets a permutation instead."""
-        finite = jnp.all(jnp.isfinite(values))
-        values = jnp.where(finite, values, jnp.asarray(self._permutation, values.dtype))
+        functions of klujax sort the places in each program anew."""
+        values, finite = self.finite(values)
         kind = "c128" if jnp.iscomplexobj(values) else "f64"
         call = getattr(klujax(), f"{name}_{kind}").bind
         where = jnp.asarray(self.rows), jnp.asarray(self.columns)
         columns = b.reshape(1, self.size, -1)
-        x = call(*where, values[None], columns, self._symbol).reshape(b.shape)
+        x = call(*where, values[None], columns, self.symbol).reshape(b.shape)
         return jnp.where(finite, x, jnp.nan)
 
     @property
-    def _symbol(self) -> Array:
+    def symbol(self) -> Array:
         return jnp.asarray(_analyzed(self).raw, jnp.uint64)
 
     @ft.cached_property
-    def _permutation(self) -> np.ndarray | None:
+    def permutation(self) -> np.ndarray | None:
         """The values of a matrix that is a permutation; `None` if every matrix with these places is
         singular."""
         ones = np.ones(len(self.numbers), np.int8)
@@ -193,6 +206,95 @@ def _analyzed(places: Places) -> Any:
                 found = package.analyze(places.rows, places.columns, places.size)
             _ANALYZED[places] = found
         return _ANALYZED[places]
+
+
+def is_bounded(x: Array) -> Bool[Array, ""]:
+    """Whether a solution shows that a matrix is regular to roundoff."""
+    return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(x.dtype).eps)))
+
+
+# ---- Factors that are kept ----
+
+
+class Factor:
+    """The factor of a matrix, kept until `freed`.
+
+    What a program holds is the address of the factor, and JAX and XLA know nothing of that. So all
+    of the following must hold, and does inside of `Radau`, whose Newton iteration factors, solves
+    and frees.
+
+    - The calls that factor and free are marked as having side effects, so that XLA neither moves
+      them out of a loop nor merges two of them. For JAX they are pure: what is computed again in
+      a reverse pass is all of them, because results that `freed` returns depend on all.
+    - A factor has one work space. So a right-hand side must depend on the solution before it.
+    - An address that all lanes of a batch have in common is freed once.
+    - No address leaves the function that is solved for, whose derivative is by the implicit
+      function theorem. So it is never carried by a loop, and never differentiated.
+    """
+
+    def __init__(self, places: Places, values: Shaped[Array, " k"]):
+        values, self._finite = places.finite(values.astype(complex))
+        where = jnp.asarray(places.rows), jnp.asarray(places.columns)
+        self._places = places
+        self._address = _kept().factor.bind(*where, values[None], places.symbol)
+
+    def solve(self, b: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
+        call = klujax().solve_with_numeric_c128.bind
+        x = call(self._places.symbol, self._address, b.astype(complex)[None, :, None])
+        return jnp.where(self._finite, x.reshape(b.shape), jnp.nan)
+
+    def freed(self, last: Array, *results: Array) -> tuple[Array, ...]:
+        """The results, after the factor is freed, which is after the `last` solution is known."""
+        # No number is larger than infinity, but XLA does not use that.
+        never = jnp.any(last > jnp.inf).astype(jnp.uint64)
+        done = _kept().free.bind(self._address, never) == 1
+        return tuple(jnp.where(done, x, jnp.zeros((), x.dtype)) for x in results)
+
+
+class _Calls(NamedTuple):
+    factor: Primitive
+    free: Primitive
+
+
+@ft.cache
+def _kept() -> _Calls:
+    """The calls that factor and free, for batches too."""
+    import klujax_cpp  # a part of klujax
+
+    klujax()
+    jax.ffi.register_ffi_target(_FREE, klujax_cpp.free_numeric(), platform="cpu")
+    factor, free = Primitive("conserve_klu_factor"), Primitive(_FREE)
+    address = jax.core.ShapedArray
+
+    def free_late(address: Array, never: Array) -> Array:
+        shape = jax.ShapeDtypeStruct((), jnp.int32)
+        return jax.ffi.ffi_call(_FREE, shape, has_side_effect=True)(address + never)
+
+    def factor_lanes(given: Any, axes: Any) -> tuple[Array, int]:
+        rows, columns, values, symbol = given
+        values = jnp.moveaxis(values, axes[2], 0)
+        found = factor.bind(rows, columns, values.reshape(-1, values.shape[-1]), symbol)
+        return found.reshape(values.shape[:2]), 0
+
+    def free_lanes(given: Any, axes: Any) -> tuple[Array, None]:
+        never = given[1] if axes[1] is None else jnp.max(given[1])
+        return free.bind(given[0].reshape(-1), never), None
+
+    factor.def_abstract_eval(
+        lambda rows, columns, values, symbol: address(values.shape[:1], jnp.uint64)
+    )
+    free.def_abstract_eval(lambda *_: address((), jnp.int32))
+    in_lanes = batching.primitive_batchers
+    in_lanes[factor], in_lanes[free] = factor_lanes, free_lanes
+    lowering = jax.ffi.ffi_lowering("factor_c128", has_side_effect=True)
+    mlir.register_lowering(factor, lowering, platform="cpu")
+    mlir.register_lowering(free, mlir.lower_fun(free_late, multiple_results=False), platform="cpu")
+    for one in (factor, free):
+        one.def_impl(jax.jit(one.bind))
+    return _Calls(factor, free)
+
+
+_FREE = "conserve_klu_free"
 
 
 class SparseJacobian:
