@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
@@ -125,6 +126,30 @@ def test_a_singular_lane_fails_without_harm_to_others(monkeypatch):
     assert list(ok) == [True, False, True]
     np.testing.assert_allclose(ends[2], ends[0], atol=1e-5)
     np.testing.assert_allclose(ends[0][N // 2 :], np.cos(ends[0][: N // 2]), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_gradient_of_ten_thousand_unknowns_is_the_difference():
+    n = 10**4
+
+    def f(t, y, rate):
+        beside = jnp.concatenate([y[:1], y[:-1]]) + jnp.concatenate([y[1:], y[-1:]])
+        return rate * (1e4 * (beside - 2 * y) - y**3)
+
+    y0 = jnp.cos(jnp.arange(n) / 300.0)
+    finder = diffrax.VeryChord(rtol=1e-13, atol=1e-13, norm=optx.rms_norm)
+
+    @jax.jit
+    def total(rate):
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(f), dfc.Radau(root_finder=finder), 0.0, 1.0, 0.1, y0, rate,
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=10,
+        )  # fmt: skip
+        return jnp.mean(found.ys[-1] ** 2)
+
+    found = jax.jit(jax.grad(total))(1.0)
+    near, far = ((total(1 + h) - total(1 - h)) / (2 * h) for h in (1e-2, 2e-2))
+    np.testing.assert_allclose(found, (4 * near - far) / 3, rtol=1e-6)
 
 
 def test_sparse_systems_are_used_from_a_size_on():
