@@ -197,9 +197,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 # A change by the roundoff of the state cannot become smaller.
                 rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
                 settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-                return keep_done(counter, (new, now_size), now), after_step(
-                    settled, rate < 2, counter
-                )
+                then = after_step(settled, rate < 2, counter)
+                return keep_done(counter, (new, now_size), now), then
 
             begin = guess, jnp.asarray(jnp.inf, start.dtype)
             found = iterate(advance, begin, max_steps=self.root_find_max_steps)
@@ -207,12 +206,10 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             slopes = -jnp.asarray(_ERROR, start.dtype) @ (y - start) / length
 
             def filtered(y: Array, before: Array) -> Array:
-                # The solution waits for the one before, also if the equations contain no `y`.
-                known = jnp.all(jnp.isfinite(before))
-                return -real(jnp.where(known, seen(residual(t0, y, slopes)), jnp.nan))
+                return -real(seen(residual(t0, y, slopes)), after=before)
 
-            first = filtered(start, y)
-            error = filtered(start + first, first)
+            first = filtered(start, before=y)
+            error = filtered(start + first, before=first)
             y, error = freed(error, y, error)
             return found._replace(y=y, more=error)
 

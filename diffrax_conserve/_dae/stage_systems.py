@@ -28,7 +28,7 @@ from .._numerics.linear import lu_factors, lu_solution
 
 # `F(t, y, y')` of vectors.
 Residual = Callable[..., Array]
-Solve = Callable[[Array], Array]
+Solve = Callable[..., Array]
 Freed = Callable[..., tuple[Array, ...]]
 
 
@@ -48,14 +48,13 @@ class DenseSystems(NamedTuple):
         return jnp.abs(self.by_y) @ jnp.abs(y) + jnp.abs(self.by_slope) @ jnp.abs(slope)
 
     def solvers(self, real: Any, pair: Any) -> tuple[Solve, Solve, Freed]:
-        """The solutions of linear systems, with a real and a complex share; and what frees the
-        factors after the last real solution is known, and returns results that do not exist
-        before. The right-hand side of each must depend on the solution before it."""
+        """The solutions of linear systems with a real and with a complex share, and a function that
+        ends them: it returns its results once the `last` real solution is known.
+
+        `real(b, after)` is computed after another solution, on which `b` must depend otherwise."""
         first, second = (lu_factors(share * self.by_slope + self.by_y) for share in (real, pair))
-        return (
-            ft.partial(lu_solution, first), ft.partial(lu_solution, second),
-            lambda last, *results: results,
-        )  # fmt: skip
+        solve = lambda b, after=None: lu_solution(first, b)  # noqa: E731
+        return solve, ft.partial(lu_solution, second), lambda last, *results: results
 
 
 class SparseSystems(NamedTuple):
@@ -82,7 +81,7 @@ class SparseSystems(NamedTuple):
     def solvers(self, real: Any, pair: Any) -> tuple[Solve, Solve, Freed]:
         places = self.places.of_both
         if places.permutation is None:
-            nan = lambda b: jnp.full_like(b, jnp.nan)  # noqa: E731
+            nan = lambda b, after=None: jnp.full_like(b, jnp.nan)  # noqa: E731
             return nan, nan, lambda last, *results: results
         # The factor of the test is that of the real matrix too, whose solution is the real part.
         scaled, heights, widths, b = places.in_general_position(real * self.by_slope + self.by_y)
@@ -93,8 +92,8 @@ class SparseSystems(NamedTuple):
         known = jnp.where(regular, self.by_y, jnp.nan)
         second = Factor(places, pair * self.by_slope + known)
 
-        def solve(b: Array) -> Array:
-            return first.solve(jnp.where(regular, b / heights, jnp.nan)).real / widths
+        def solve(b: Array, after: Array = regular) -> Array:
+            return first.solve(b / heights, after).real / widths
 
         def freed(last: Array, *results: Array) -> tuple[Array, ...]:
             return first.freed(last, *second.freed(last, *results))

@@ -2,9 +2,9 @@
 
 KLU (T. A. Davis and E. Palamadai Natarajan, *Algorithm 907: KLU, a direct sparse solver for circuit
 simulation problems*, ACM Trans. Math. Softw. 37, 2010) orders the places of a matrix once, which is
-done while a solve is traced. A solve inside of `jit` then factors the values, and keeps no factor, so
-that there is nothing to free, and lanes and threads do not disturb each other. Where several
-systems have the same matrix, `Factor` keeps its factor from the first to the last of them.
+done while a solve is traced. A solve inside of `jit` then factors the values, and keeps no factor:
+nothing has to be freed, and lanes and threads do not disturb each other. Where several systems have
+the same matrix, as in a step of `Radau`, a `Factor` is kept from the first to the last of them.
 
 KLU works on a CPU, with float64 and complex128. A pivot that is exactly zero raises an error that
 ends the program, so a matrix is tested before; see `Places.is_regular`.
@@ -217,19 +217,19 @@ def is_bounded(x: Array) -> Bool[Array, ""]:
 
 
 class Factor:
-    """The factor of a matrix, kept until `freed`.
+    """The factor of a complex matrix, kept until it is `freed`.
 
-    What a program holds is the address of the factor, and JAX and XLA know nothing of that. So all
-    of the following must hold, and does inside of `Radau`, whose Newton iteration factors, solves
-    and frees.
+    What a program holds is the address of the factor, of which JAX and XLA know nothing. So these
+    rules must hold:
 
-    - The calls that factor and free are marked as having side effects, so that XLA neither moves
-      them out of a loop nor merges two of them. For JAX they are pure: what is computed again in
-      a reverse pass is all of them, because results that `freed` returns depend on all.
-    - A factor has one work space. So a right-hand side must depend on the solution before it.
-    - An address that all lanes of a batch have in common is freed once.
-    - No address leaves the function that is solved for, whose derivative is by the implicit
-      function theorem. So it is never carried by a loop, and never differentiated.
+    - For XLA the calls that factor and free have side effects, so that it neither moves them out of
+      a loop nor merges two that are equal. For JAX they are pure, so that a reverse pass may
+      compute them again. What `freed` returns depends on all of them, so it computes all.
+    - A factor has one work space, so that two solves must not overlap: each right-hand side depends
+      on the solution before it.
+    - An address that the lanes of a batch share is freed once.
+    - No loop carries an address, and nothing that contains one is differentiated: it stays inside
+      of an iteration whose derivative is by the implicit function theorem.
     """
 
     def __init__(self, places: Places, values: Shaped[Array, " k"]):
@@ -238,7 +238,12 @@ class Factor:
         self._places = places
         self._address = _kept().factor.bind(*where, values[None], places.symbol)
 
-    def solve(self, b: Shaped[Array, " n"]) -> Shaped[Array, " n"]:
+    def solve(self, b: Shaped[Array, " n"], after: Any = None) -> Shaped[Array, " n"]:
+        """`A⁻¹ b`; NaN if the matrix is not finite. A solution or flag `after` which this is
+        computed makes sure of the order, if `b` does not; if it is NaN or false, this is NaN."""
+        if after is not None:
+            flag = after if after.dtype == bool else jnp.all(jnp.isfinite(after))
+            b = jnp.where(flag, b, jnp.nan)
         call = klujax().solve_with_numeric_c128.bind
         x = call(self._places.symbol, self._address, b.astype(complex)[None, :, None])
         return jnp.where(self._finite, x.reshape(b.shape), jnp.nan)
@@ -248,7 +253,7 @@ class Factor:
         # No number is larger than infinity, but XLA does not use that.
         never = jnp.any(last > jnp.inf).astype(jnp.uint64)
         done = _kept().free.bind(self._address, never) == 1
-        return tuple(jnp.where(done, x, jnp.zeros((), x.dtype)) for x in results)
+        return tuple(jnp.where(done, x, jnp.nan) for x in results)
 
 
 class _Calls(NamedTuple):
@@ -256,19 +261,28 @@ class _Calls(NamedTuple):
     free: Primitive
 
 
-@ft.cache
-def _kept() -> _Calls:
-    """The calls that factor and free, for batches too."""
-    import klujax_cpp  # a part of klujax
+_FREE = "conserve_klu_free"
+_KEPT: list[_Calls] = []
 
+
+def _kept() -> _Calls:
     klujax()
+    with _LOCK:
+        if not _KEPT:
+            _KEPT.append(_calls())
+        return _KEPT[0]
+
+
+def _calls() -> _Calls:
+    """The calls that factor and free, alone and in lanes."""
+    import klujax_cpp  # of klujax
+
     jax.ffi.register_ffi_target(_FREE, klujax_cpp.free_numeric(), platform="cpu")
     factor, free = Primitive("conserve_klu_factor"), Primitive(_FREE)
-    address = jax.core.ShapedArray
 
     def free_late(address: Array, never: Array) -> Array:
-        shape = jax.ShapeDtypeStruct((), jnp.int32)
-        return jax.ffi.ffi_call(_FREE, shape, has_side_effect=True)(address + never)
+        done = jax.ShapeDtypeStruct((), jnp.int32)
+        return jax.ffi.ffi_call(_FREE, done, has_side_effect=True)(address + never)
 
     def factor_lanes(given: Any, axes: Any) -> tuple[Array, int]:
         rows, columns, values, symbol = given
@@ -277,24 +291,20 @@ def _kept() -> _Calls:
         return found.reshape(values.shape[:2]), 0
 
     def free_lanes(given: Any, axes: Any) -> tuple[Array, None]:
-        never = given[1] if axes[1] is None else jnp.max(given[1])
-        return free.bind(given[0].reshape(-1), never), None
+        address, never = given
+        return free.bind(address.reshape(-1), never if axes[1] is None else jnp.max(never)), None
 
-    factor.def_abstract_eval(
-        lambda rows, columns, values, symbol: address(values.shape[:1], jnp.uint64)
-    )
-    free.def_abstract_eval(lambda *_: address((), jnp.int32))
-    in_lanes = batching.primitive_batchers
-    in_lanes[factor], in_lanes[free] = factor_lanes, free_lanes
+    aval = jax.core.ShapedArray
+    factor.def_abstract_eval(lambda *given: aval(given[2].shape[:1], jnp.uint64))
+    free.def_abstract_eval(lambda *given: aval((), jnp.int32))
+    batching.primitive_batchers[factor] = factor_lanes
+    batching.primitive_batchers[free] = free_lanes
     lowering = jax.ffi.ffi_lowering("factor_c128", has_side_effect=True)
     mlir.register_lowering(factor, lowering, platform="cpu")
     mlir.register_lowering(free, mlir.lower_fun(free_late, multiple_results=False), platform="cpu")
     for one in (factor, free):
         one.def_impl(jax.jit(one.bind))
     return _Calls(factor, free)
-
-
-_FREE = "conserve_klu_free"
 
 
 class SparseJacobian:

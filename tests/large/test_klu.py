@@ -175,7 +175,11 @@ def _solved_twice(places, values, b):
 @pytest.mark.parametrize("dtype", [np.float64, np.complex128])
 def test_a_factor_that_is_kept_solves_alone_and_in_lanes(dtype):
     n = 40
-    a = np.eye(n) - 0.4 * np.eye(n, k=1) + 0.3 * np.eye(n, k=-3) * (1j if dtype == complex else 1)
+    a = (
+        np.eye(n)
+        - 0.4 * np.eye(n, k=1)
+        + 0.3 * np.eye(n, k=-3) * (1j if np.issubdtype(dtype, np.complexfloating) else 1)
+    )
     places, values = _places(a.astype(dtype))
     solve = ft.partial(_solved_twice, places)
     bs = np.random.default_rng(1).normal(size=(2, 3, n)).astype(complex)
