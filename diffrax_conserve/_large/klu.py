@@ -20,6 +20,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
@@ -294,9 +295,8 @@ def _calls() -> _Calls:
         address, never = given
         return free.bind(address.reshape(-1), never if axes[1] is None else jnp.max(never)), None
 
-    aval = jax.core.ShapedArray
-    factor.def_abstract_eval(lambda *given: aval(given[2].shape[:1], jnp.uint64))
-    free.def_abstract_eval(lambda *given: aval((), jnp.int32))
+    factor.def_abstract_eval(lambda *given: ShapedArray(given[2].shape[:1], jnp.uint64))
+    free.def_abstract_eval(lambda *given: ShapedArray((), jnp.int32))
     batching.primitive_batchers[factor] = factor_lanes
     batching.primitive_batchers[free] = free_lanes
     lowering = jax.ffi.ffi_lowering("factor_c128", has_side_effect=True)
