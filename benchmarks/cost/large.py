@@ -39,7 +39,7 @@ except ImportError:
     IDA = None
 
 ERROR = 1e-5
-TOLERANCES = {"radau": [1e-3, 1e-4, 1e-5], "ida": [1e-4, 1e-5, 1e-6, 1e-7]}
+TOLERANCES = {"radau": [1e-3, 1e-4, 1e-5], "ida": [1e-4, 1e-5, 1e-6, 1e-7, 1e-8]}
 
 
 # ---- The problems: `f`, the mass matrix, a guess, the end, and the width of a narrow band ----

@@ -267,7 +267,7 @@ _KEPT: list[_Calls] = []
 
 
 def _kept() -> _Calls:
-    klujax()
+    klujax()  # which takes the lock too
     with _LOCK:
         if not _KEPT:
             _KEPT.append(_calls())
@@ -276,9 +276,8 @@ def _kept() -> _Calls:
 
 def _calls() -> _Calls:
     """The calls that factor and free, alone and in lanes."""
-    import klujax_cpp  # of klujax
-
-    jax.ffi.register_ffi_target(_FREE, klujax_cpp.free_numeric(), platform="cpu")
+    free_numeric = klujax().klujax_cpp.free_numeric()  # there is no public call inside of `jit`
+    jax.ffi.register_ffi_target(_FREE, free_numeric, platform="cpu")
     factor, free = Primitive("conserve_klu_factor"), Primitive(_FREE)
 
     def free_late(address: Array, never: Array) -> Array:
