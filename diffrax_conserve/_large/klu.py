@@ -240,8 +240,9 @@ class Factor:
         self._address = _kept().factor.bind(*where, values[None], places.symbol)
 
     def solve(self, b: Shaped[Array, " n"], after: Any = None) -> Shaped[Array, " n"]:
-        """`A⁻¹ b`; NaN if the matrix is not finite. A solution or flag `after` which this is
-        computed makes sure of the order, if `b` does not; if it is NaN or false, this is NaN."""
+        """`A⁻¹ b`; NaN if the matrix is not finite. If `b` need not depend on the solution before
+        it, that, or a flag that depends on it, is passed as `after`: the result is NaN if `after`
+        is false or not finite."""
         if after is not None:
             flag = after if after.dtype == bool else jnp.all(jnp.isfinite(after))
             b = jnp.where(flag, b, jnp.nan)
