@@ -15,12 +15,12 @@ from .._constants import ROUNDOFF
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, after_step, iterate, keep_done
+from .._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from .._options import check_counts
 from .._projection.options import check_state, option
 from .._solver.terms import time_direction, vector_fields
 from .._time import nonzero_length
-from .._tree import ravel, unravel
+from .._tree import eps_of, ravel, unravel
 from .stage_systems import systems_at
 
 # The nodes of the method, its inverse matrix `A⁻¹`, by which slopes follow from increments, and the
@@ -167,7 +167,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
         sizes = systems.sizes_of_terms(start, start / length)
-        least = ROUNDOFF * float(jnp.finfo(start.dtype).eps) * sizes
+        least = ROUNDOFF * eps_of(start) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
         finder, pair_dtype = self.root_finder, jnp.result_type(start, complex(0))
 
@@ -188,17 +188,17 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 other = 2 * (vectors[:, 1, None] * second).real
                 return vectors[:, 0, None].real * first + other
 
-            def advance(now: Any, counter: Array) -> tuple[Any, Array]:
+            def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
                 y, before = now
                 change = correction(seen(stages(y)))
                 new = y + change
                 now_size = size(change, new)
                 rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
                 # A change by the roundoff of the state cannot become smaller.
-                rounded = now_size <= size(ROUNDOFF * float(jnp.finfo(new.dtype).eps) * new, new)
+                rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
                 settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-                then = after_step(settled, rate < 2, counter)
-                return keep_done(counter, (new, now_size), now), then
+                then = left_after_step(settled, rate < 2, tests_left)
+                return keep_done(tests_left, (new, now_size), now), then
 
             begin = guess, jnp.asarray(jnp.inf, start.dtype)
             found = iterate(advance, begin, max_steps=self.root_find_max_steps)
@@ -211,10 +211,10 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             first = filtered(start, before=y)
             error = filtered(start + first, before=first)
             y, error = freed(error, y, error)
-            return found._replace(y=y, more=error)
+            return found._replace(y=y, aux=error)
 
         found = root(stages, newton, guess, systems.stages_solution, systems.stages_jacobian)
-        y, error = found.y, found.more
+        y, error = found.y, found.aux
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
         ok = found.ok & jnp.all(jnp.isfinite(error))

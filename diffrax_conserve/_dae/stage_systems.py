@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import LARGE_DENSE, LEAST_KLU
+from .._constants import MIN_KLU, WARN_DENSE
 from .._large.klu import (
     Factor,
     Places,
@@ -154,10 +154,10 @@ def systems_at(residual: Residual, t: Any, y: Array, slope: Array) -> DenseSyste
     """The linear systems with the derivatives at a time, a state and slopes: sparse ones where that
     is faster."""
     n, dense = y.size, ft.partial(DenseSystems.at, residual, t, y, slope)
-    if n < LEAST_KLU:
+    if n < MIN_KLU:
         return dense()
     if not available(y.dtype):
-        if n >= LARGE_DENSE and y.dtype == jnp.float64 and why_not():
+        if n >= WARN_DENSE and y.dtype == jnp.float64 and why_not():
             warnings.warn(
                 f"`Radau` solves dense linear systems with {n} unknowns, because {why_not()}",
                 stacklevel=2,

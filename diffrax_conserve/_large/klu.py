@@ -26,7 +26,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
-from .._tree import without_pattern
+from .._tree import eps_of, irregular_weights
 from .asdex_import import asdex
 from .detection import constants_of, content_key, jacobian_places
 
@@ -148,7 +148,7 @@ class Places:
         scaled = values / heights[self.rows]
         widths = jax.ops.segment_max(jnp.abs(scaled), self.columns, self.size)
         widths = jnp.where(widths == 0, 1, widths)
-        pattern = without_pattern(len(self.numbers) + self.size, values.dtype)
+        pattern = irregular_weights(len(self.numbers) + self.size, values.dtype)
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
         scaled = scaled / widths[self.columns] + _TINY * 1j * shift
         return scaled, heights, widths, b.astype(scaled.dtype)
@@ -211,7 +211,7 @@ def _analyzed(places: Places) -> Any:
 
 def is_bounded(x: Array) -> Bool[Array, ""]:
     """Whether a solution shows that a matrix is regular to roundoff."""
-    return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * float(jnp.finfo(x.dtype).eps)))
+    return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * eps_of(x)))
 
 
 # ---- Factors that are kept ----

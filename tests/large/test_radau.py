@@ -23,7 +23,7 @@ def both(monkeypatch):
 
     def agree(compute, rtol):
         for least in (2, 10**6):
-            monkeypatch.setattr(stage_systems, "LEAST_KLU", least)
+            monkeypatch.setattr(stage_systems, "MIN_KLU", least)
             found = jax.tree.leaves(jax.jit(compute)())
             want = found if least == 2 else want
         for a, b in zip(found, want, strict=True):
@@ -85,7 +85,7 @@ def test_derivatives_are_those_of_dense_systems(both, name):
 )
 def test_each_program_frees_what_it_factors(monkeypatch, name):
     """In each computation, such as the body of a loop, and in the passes of derivatives."""
-    monkeypatch.setattr(stage_systems, "LEAST_KLU", 2)
+    monkeypatch.setattr(stage_systems, "MIN_KLU", 2)
     order = jax.jacfwd if name == "forward" else jax.grad
     rates = jnp.array([0.1, 1.0, 3.0])
 
@@ -103,7 +103,7 @@ def test_each_program_frees_what_it_factors(monkeypatch, name):
 
 def test_a_singular_lane_fails_without_harm_to_others(monkeypatch):
     """The pencil of the equations is singular where `args` is zero."""
-    monkeypatch.setattr(stage_systems, "LEAST_KLU", 2)
+    monkeypatch.setattr(stage_systems, "MIN_KLU", 2)
 
     def f(t, y, args):
         x, z = y[: N // 2], y[N // 2 :]
