@@ -6,6 +6,7 @@ the tables of the pages to the results.
 """
 
 import argparse
+import math
 import runpy
 from typing import Any
 
@@ -16,8 +17,9 @@ from matplotlib.ticker import LogLocator
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-PAGES = [DOCS / f"{x}.md" for x in ("performance", "many-constraints", "differential-algebraic")]
-NAMES = ("scaling", "many_constraints", "dae")
+FILES = ("performance", "many-constraints", "differential-algebraic", "large-stiff")
+PAGES = [DOCS / f"{x}.md" for x in FILES]
+NAMES = ("scaling", "many_constraints", "dae", "large")
 # Of each system: the integrals that are kept, and the numbers in its state.
 SIZES = {"rigid body": (2, 3), "three vortices": (4, 6), "ten vortices": (4, 20)}
 
@@ -72,6 +74,24 @@ def dae_table(results: Results) -> list[str]:
     return lines
 
 
+def large_table(results: Results) -> list[str]:
+    """Large stiff equations beside IDA, at equal error."""
+    heads = (
+        "problem | unknowns | steps | seconds | those of IDA | ratio | first call, s | memory, MB"
+    )
+    lines = [f"| {heads} |", "|" + "---|" * 8]
+    for name, found in results["large"]["results"].items():
+        radau = found["radau"]
+        nearest = min(
+            range(len(radau["errors"])), key=lambda k: abs(math.log(radau["errors"][k] / 1e-5))
+        )
+        steps = radau["accepted"][nearest] + radau["rejected"][nearest]
+        cells = [name.split(",")[0], f"{found['n']:,}", f"{steps:,}", f"{radau['at_error']:.2g}"]
+        cells += [f"{found['ida']:.2g}", f"{found['ratio']:.1f}", f"{found['first_call']:.0f}"]
+        lines.append(f"| {' | '.join(cells)} | {found['memory'] / 1e6:.0f} |")
+    return lines
+
+
 def machine_lines(results: Results) -> list[str]:
     """One line: what `scaling.py` ran on, and when it began."""
     about = results["scaling"]["machine"]
@@ -90,6 +110,7 @@ def tables(results: Results) -> dict[str, list[str]]:
         "machine": machine_lines(results),
         "many constraints": many_table(results),
         "beside IDA": dae_table(results),
+        "large beside IDA": large_table(results),
     }
 
 

@@ -169,52 +169,54 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         sizes = systems.sizes_of_terms(start, start / length)
         least = ROUNDOFF * eps_of(start) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
-        real, pair = systems.solvers(_REAL / length, _PAIR / length)
-
-        def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
-            """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the stages,
-            by the eigenvectors of `A⁻¹`."""
-            vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
-            modes = -to_modes @ residuals
-            first, second = real(modes[0].real), pair(modes[1])
-            other = 2 * (vectors[:, 1, None] * second).real
-            return vectors[:, 0, None].real * first + other
-
         finder, pair_dtype = self.root_finder, jnp.result_type(start, complex(0))
 
         def size(change: Array, y: Array) -> Array:
             scale = finder.atol + finder.rtol * jnp.abs(y)
             return finder.norm(jax.vmap(lambda x: unravel(x, y0))(change / scale))
 
-        def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-            y, before = now
-            change = correction(seen(stages(y)))
-            new = y + change
-            now_size = size(change, new)
-            rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
-            # A change by the roundoff of the state cannot become smaller.
-            rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
-            settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-            return keep_done(tests_left, (new, now_size), now), left_after_step(
-                settled, rate < 2, tests_left
-            )
-
         def newton(guess: Array) -> Solved:
+            """The stages, and the error estimate."""
+            real, pair, freed = systems.solvers(_REAL / length, _PAIR / length)
+
+            def correction(residuals: Float[Array, "3 n"]) -> Float[Array, "3 n"]:
+                """`-J⁻¹ residuals`, with the Jacobian `J = A⁻¹/h ⊗ ∂F/∂y' + I ⊗ ∂F/∂y` of the
+                stages, by the eigenvectors of `A⁻¹`."""
+                vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
+                modes = -to_modes @ residuals
+                first, second = real(modes[0].real), pair(modes[1])
+                other = 2 * (vectors[:, 1, None] * second).real
+                return vectors[:, 0, None].real * first + other
+
+            def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
+                y, before = now
+                change = correction(seen(stages(y)))
+                new = y + change
+                now_size = size(change, new)
+                rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
+                # A change by the roundoff of the state cannot become smaller.
+                rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
+                settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
+                then = left_after_step(settled, rate < 2, tests_left)
+                return keep_done(tests_left, (new, now_size), now), then
+
             begin = guess, jnp.asarray(jnp.inf, start.dtype)
             found = iterate(advance, begin, max_steps=self.root_find_max_steps)
-            return found._replace(y=found.y[0])
+            y = found.y[0]
+            slopes = -jnp.asarray(_ERROR, start.dtype) @ (y - start) / length
+
+            def filtered(y: Array, before: Array) -> Array:
+                return -real(seen(residual(t0, y, slopes)), after=before)
+
+            first = filtered(start, before=y)
+            error = filtered(start + first, before=first)
+            y, error = freed(error, y, error)
+            return found._replace(y=y, aux=error)
 
         found = root(stages, newton, guess, systems.stages_solution, systems.stages_jacobian)
-        y = found.y
+        y, error = found.y, found.aux
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
-        # The error estimate.
-        slopes = -jnp.asarray(_ERROR, start.dtype) @ increments / length
-
-        def filtered(y: Array) -> Array:
-            return -real(seen(residual(t0, y, slopes)))
-
-        error = filtered(start + filtered(start))
         ok = found.ok & jnp.all(jnp.isfinite(error))
         big = float(jnp.finfo(start.dtype).max) ** 0.5
         error = lax.stop_gradient(jnp.where(ok, error, big))

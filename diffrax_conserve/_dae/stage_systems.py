@@ -15,11 +15,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MIN_KLU, WARN_DENSE
-from .._large.klu import Places, SparseJacobian, available, sparse_jacobian, why_not
+from .._large.klu import (
+    Factor,
+    Places,
+    SparseJacobian,
+    available,
+    is_bounded,
+    sparse_jacobian,
+    why_not,
+)
 from .._numerics.linear import lu_factors, lu_solution
 
 # `F(t, y, y')` of vectors.
 Residual = Callable[..., Array]
+Solve = Callable[..., Array]
+Freed = Callable[..., tuple[Array, ...]]
 
 
 class DenseSystems(NamedTuple):
@@ -37,10 +47,14 @@ class DenseSystems(NamedTuple):
     def sizes_of_terms(self, y: Array, slope: Array) -> Float[Array, " n"]:
         return jnp.abs(self.by_y) @ jnp.abs(y) + jnp.abs(self.by_slope) @ jnp.abs(slope)
 
-    def solvers(self, *shares: Any) -> list[Callable[[Array], Array]]:
-        """For each share the solution of linear systems; the first share is real."""
-        factors = [lu_factors(share * self.by_slope + self.by_y) for share in shares]
-        return [ft.partial(lu_solution, x) for x in factors]
+    def solvers(self, real: Any, pair: Any) -> tuple[Solve, Solve, Freed]:
+        """The solutions of linear systems with a real and with a complex share, and a function that
+        ends them: it returns its results once the `last` real solution is known.
+
+        `real(b, after)` is computed after another solution, on which `b` must depend otherwise."""
+        first, second = (lu_factors(share * self.by_slope + self.by_y) for share in (real, pair))
+        solve = lambda b, after=None: lu_solution(first, b)  # noqa: E731
+        return solve, ft.partial(lu_solution, second), lambda last, *results: results
 
 
 class SparseSystems(NamedTuple):
@@ -64,13 +78,27 @@ class SparseSystems(NamedTuple):
             jnp.abs(self.by_slope), jnp.abs(slope)
         )
 
-    def solvers(self, *shares: Any) -> list[Callable[[Array], Array]]:
+    def solvers(self, real: Any, pair: Any) -> tuple[Solve, Solve, Freed]:
+        places = self.places.of_both
+        if places.permutation is None:
+            nan = lambda b, after=None: jnp.full_like(b, jnp.nan)  # noqa: E731
+            return nan, nan, lambda last, *results: results
+        # The factor of the test is that of the real matrix too, whose solution is the real part.
+        scaled, heights, widths, b = places.in_general_position(real * self.by_slope + self.by_y)
+        first = Factor(places, scaled)
+        regular = is_bounded(first.solve(b))
         # If a matrix is singular for one share, it is for all: no pencil is so for one that a
         # step size happens to have.
-        places = self.places.of_both
-        regular = places.is_regular(shares[0] * self.by_slope + self.by_y)
         known = jnp.where(regular, self.by_y, jnp.nan)
-        return [ft.partial(places.solve_regular, share * self.by_slope + known) for share in shares]
+        second = Factor(places, pair * self.by_slope + known)
+
+        def solve(b: Array, after: Array = regular) -> Array:
+            return first.solve(b / heights, after).real / widths
+
+        def freed(last: Array, *results: Array) -> tuple[Array, ...]:
+            return first.freed(last, *second.freed(last, *results))
+
+        return solve, second.solve, freed
 
 
 class _Together:

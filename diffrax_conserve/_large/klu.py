@@ -2,8 +2,9 @@
 
 KLU (T. A. Davis and E. Palamadai Natarajan, *Algorithm 907: KLU, a direct sparse solver for circuit
 simulation problems*, ACM Trans. Math. Softw. 37, 2010) orders the places of a matrix once, which is
-done while a solve is traced. A solve inside of `jit` then factors the values. No factor is kept,
-so that there is nothing to free, and lanes and threads do not disturb each other.
+done while a solve is traced. A solve inside of `jit` then factors the values, and keeps no factor:
+nothing has to be freed, and lanes and threads do not disturb each other. Where several systems have
+the same matrix, as in a step of `Radau`, a `Factor` is kept from the first to the last of them.
 
 KLU works on a CPU, with float64 and complex128. A pivot that is exactly zero raises an error that
 ends the program, so a matrix is tested before; see `Places.is_regular`.
@@ -12,13 +13,16 @@ ends the program, so a matrix is tested before; see `Places.is_regular`.
 import functools as ft
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
@@ -107,7 +111,7 @@ class Places:
     ) -> Shaped[Array, " n"]:
         """`A⁻¹ b`, of a matrix that is known to be regular, or has values that are NaN."""
         dtype = jnp.result_type(values, b)
-        if self._permutation is None:
+        if self.permutation is None:
             return jnp.full(b.shape, jnp.nan, dtype)
         values, b = values.astype(dtype), b.astype(dtype)
         return lax.custom_linear_solve(
@@ -125,43 +129,53 @@ class Places:
         element has a tiny imaginary part in general position: where real parts cancel exactly, the
         imaginary parts do not, and the pivot is tiny, but not zero. The real parts are the same.
         """
-        if self._permutation is None:
+        if self.permutation is None:
             return jnp.asarray(False)
         values = lax.stop_gradient(values)
         if jnp.iscomplexobj(values):
             real, imag = values.real, values.imag
             parts = jnp.concatenate([real, -imag, imag, real])
             return self._real_form[0].is_regular(parts[self._real_form[1]])
+        scaled, _, _, b = self.in_general_position(values)
+        return is_bounded(self._klu("solve_with_symbol", scaled, b))
+
+    def in_general_position(self, values: Float[Array, " k"]) -> tuple[Array, ...]:
+        """A real matrix with the tiny imaginary parts, in the units of its rows and columns; the
+        units; and the vector in general position."""
         sizes = jnp.abs(values)
         heights = jax.ops.segment_max(sizes, self.rows, self.size)
-        heights = jnp.where(heights == 0, 1, heights)[self.rows]
-        widths = jax.ops.segment_max(sizes / heights, self.columns, self.size)
-        widths = jnp.where(widths == 0, 1, widths)[self.columns]
+        heights = jnp.where(heights == 0, 1, heights)
+        scaled = values / heights[self.rows]
+        widths = jax.ops.segment_max(jnp.abs(scaled), self.columns, self.size)
+        widths = jnp.where(widths == 0, 1, widths)
         pattern = irregular_weights(len(self.numbers) + self.size, values.dtype)
         shift, b = jnp.split(jnp.asarray(pattern), [len(self.numbers)])
-        scaled = values / heights / widths + _TINY * 1j * shift
-        x = self._klu("solve_with_symbol", scaled, b.astype(scaled.dtype))
-        return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * eps_of(values)))
+        scaled = scaled / widths[self.columns] + _TINY * 1j * shift
+        return scaled, heights, widths, b.astype(scaled.dtype)
+
+    def finite(self, values: Array) -> tuple[Array, Bool[Array, ""]]:
+        """The values, and whether all are finite. With a matrix that is not finite KLU may find no
+        pivot, so it gets a permutation instead."""
+        finite = jnp.all(jnp.isfinite(values))
+        return jnp.where(finite, values, jnp.asarray(self.permutation, values.dtype)), finite
 
     def _klu(self, name: str, values: Array, b: Array) -> Array:
         """Calls KLU; `b` may have several columns. The primitives are bound themselves, because the
-        functions of klujax sort the places in each program anew. With a matrix that is not finite
-        KLU may find no pivot, so it gets a permutation instead."""
-        finite = jnp.all(jnp.isfinite(values))
-        values = jnp.where(finite, values, jnp.asarray(self._permutation, values.dtype))
+        functions of klujax sort the places in each program anew."""
+        values, finite = self.finite(values)
         kind = "c128" if jnp.iscomplexobj(values) else "f64"
         call = getattr(klujax(), f"{name}_{kind}").bind
         where = jnp.asarray(self.rows), jnp.asarray(self.columns)
         columns = b.reshape(1, self.size, -1)
-        x = call(*where, values[None], columns, self._symbol).reshape(b.shape)
+        x = call(*where, values[None], columns, self.symbol).reshape(b.shape)
         return jnp.where(finite, x, jnp.nan)
 
     @property
-    def _symbol(self) -> Array:
+    def symbol(self) -> Array:
         return jnp.asarray(_analyzed(self).raw, jnp.uint64)
 
     @ft.cached_property
-    def _permutation(self) -> np.ndarray | None:
+    def permutation(self) -> np.ndarray | None:
         """The values of a matrix that is a permutation; `None` if every matrix with these places is
         singular."""
         ones = np.ones(len(self.numbers), np.int8)
@@ -193,6 +207,104 @@ def _analyzed(places: Places) -> Any:
                 found = package.analyze(places.rows, places.columns, places.size)
             _ANALYZED[places] = found
         return _ANALYZED[places]
+
+
+def is_bounded(x: Array) -> Bool[Array, ""]:
+    """Whether a solution shows that a matrix is regular to roundoff."""
+    return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * eps_of(x)))
+
+
+# ---- Factors that are kept ----
+
+
+class Factor:
+    """The factor of a complex matrix, kept until it is `freed`.
+
+    What a program holds is the address of the factor, of which JAX and XLA know nothing. So these
+    rules must hold:
+
+    - For XLA the calls that factor and free have side effects, so that it neither moves them out of
+      a loop nor merges two that are equal. For JAX they are pure, so that a reverse pass may
+      compute them again. What `freed` returns depends on all of them, so it computes all.
+    - A factor has one work space, so that two solves must not overlap: each right-hand side depends
+      on the solution before it.
+    - An address that the lanes of a batch share is freed once.
+    - No loop carries an address, and nothing that contains one is differentiated: it stays inside
+      of an iteration whose derivative is by the implicit function theorem.
+    """
+
+    def __init__(self, places: Places, values: Shaped[Array, " k"]):
+        values, self._finite = places.finite(values.astype(complex))
+        where = jnp.asarray(places.rows), jnp.asarray(places.columns)
+        self._places = places
+        self._address = _kept().factor.bind(*where, values[None], places.symbol)
+
+    def solve(self, b: Shaped[Array, " n"], after: Any = None) -> Shaped[Array, " n"]:
+        """`A⁻¹ b`; NaN if the matrix is not finite. If `b` need not depend on the solution before
+        it, that, or a flag that depends on it, is passed as `after`: the result is NaN if `after`
+        is false or not finite."""
+        if after is not None:
+            flag = after if after.dtype == bool else jnp.all(jnp.isfinite(after))
+            b = jnp.where(flag, b, jnp.nan)
+        call = klujax().solve_with_numeric_c128.bind
+        x = call(self._places.symbol, self._address, b.astype(complex)[None, :, None])
+        return jnp.where(self._finite, x.reshape(b.shape), jnp.nan)
+
+    def freed(self, last: Array, *results: Array) -> tuple[Array, ...]:
+        """The results, after the factor is freed, which is after the `last` solution is known."""
+        # No number is larger than infinity, but XLA does not use that.
+        never = jnp.any(last > jnp.inf).astype(jnp.uint64)
+        done = _kept().free.bind(self._address, never) == 1
+        return tuple(jnp.where(done, x, jnp.nan) for x in results)
+
+
+class _Calls(NamedTuple):
+    factor: Primitive
+    free: Primitive
+
+
+_FREE = "conserve_klu_free"
+_KEPT: list[_Calls] = []
+
+
+def _kept() -> _Calls:
+    klujax()  # which takes the lock too
+    with _LOCK:
+        if not _KEPT:
+            _KEPT.append(_calls())
+        return _KEPT[0]
+
+
+def _calls() -> _Calls:
+    """The calls that factor and free, alone and in lanes."""
+    free_numeric = klujax().klujax_cpp.free_numeric()  # there is no public call inside of `jit`
+    jax.ffi.register_ffi_target(_FREE, free_numeric, platform="cpu")
+    factor, free = Primitive("conserve_klu_factor"), Primitive(_FREE)
+
+    def free_late(address: Array, never: Array) -> Array:
+        done = jax.ShapeDtypeStruct((), jnp.int32)
+        return jax.ffi.ffi_call(_FREE, done, has_side_effect=True)(address + never)
+
+    def factor_lanes(given: Any, axes: Any) -> tuple[Array, int]:
+        rows, columns, values, symbol = given
+        values = jnp.moveaxis(values, axes[2], 0)
+        found = factor.bind(rows, columns, values.reshape(-1, values.shape[-1]), symbol)
+        return found.reshape(values.shape[:2]), 0
+
+    def free_lanes(given: Any, axes: Any) -> tuple[Array, None]:
+        address, never = given
+        return free.bind(address.reshape(-1), never if axes[1] is None else jnp.max(never)), None
+
+    factor.def_abstract_eval(lambda *given: ShapedArray(given[2].shape[:1], jnp.uint64))
+    free.def_abstract_eval(lambda *given: ShapedArray((), jnp.int32))
+    batching.primitive_batchers[factor] = factor_lanes
+    batching.primitive_batchers[free] = free_lanes
+    lowering = jax.ffi.ffi_lowering("factor_c128", has_side_effect=True)
+    mlir.register_lowering(factor, lowering, platform="cpu")
+    mlir.register_lowering(free, mlir.lower_fun(free_late, multiple_results=False), platform="cpu")
+    for one in (factor, free):
+        one.def_impl(jax.jit(one.bind))
+    return _Calls(factor, free)
 
 
 class SparseJacobian:

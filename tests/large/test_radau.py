@@ -7,6 +7,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
@@ -77,6 +78,78 @@ def test_derivatives_are_those_of_dense_systems(both, name):
     if name == "forward":
         difference = (total(1.001) - total(0.999)) / 0.002
         np.testing.assert_allclose(found, difference, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "name", ["checkpoints", "forward", pytest.param("direct", marks=pytest.mark.slow)]
+)
+def test_each_program_frees_what_it_factors(monkeypatch, name):
+    """In each computation, such as the body of a loop, and in the passes of derivatives."""
+    monkeypatch.setattr(stage_systems, "MIN_KLU", 2)
+    order = jax.jacfwd if name == "forward" else jax.grad
+    rates = jnp.array([0.1, 1.0, 3.0])
+
+    def total(rate):
+        return jnp.sum(solved(start(), rate, ADJOINTS[name])[0] ** 2)
+
+    for fn, given in ((order(total), rates[0]), (jax.vmap(order(total)), rates)):
+        text = jax.jit(fn).lower(given).compile().as_text()
+        computations = text.split("\n\n")
+        factored = [part.count('custom_call_target="factor_c128"') for part in computations]
+        freed = [part.count('custom_call_target="conserve_klu_free"') for part in computations]
+        assert sum(factored) >= 2
+        assert factored == freed
+
+
+def test_a_singular_lane_fails_without_harm_to_others(monkeypatch):
+    """The pencil of the equations is singular where `args` is zero."""
+    monkeypatch.setattr(stage_systems, "MIN_KLU", 2)
+
+    def f(t, y, args):
+        x, z = y[: N // 2], y[N // 2 :]
+        return jnp.concatenate([z - 1e3 * (x - jnp.roll(x, 1)), args * (z - jnp.cos(x))])
+
+    mass = np.diag(np.repeat([1.0, 0.0], N // 2))
+    dae = dfc.DAE(f, mass=mass)
+    y0 = dae.consistent(start(), args=1.0)
+
+    @jax.jit
+    @jax.vmap
+    def lanes(args):
+        found = diffrax.diffeqsolve(
+            dae.term, dae.wrap(dfc.Radau()), 0.0, 0.5, 1e-3, y0, args, max_steps=64, throw=False,
+            stepsize_controller=diffrax.PIDController(rtol=1e-6, atol=1e-6),
+        )  # fmt: skip
+        return found.ys[-1], found.result == diffrax.RESULTS.successful
+
+    ends, ok = lanes(jnp.array([1.0, 0.0, 2.0]))
+    assert list(ok) == [True, False, True]
+    np.testing.assert_allclose(ends[2], ends[0], atol=1e-5)
+    np.testing.assert_allclose(ends[0][N // 2 :], np.cos(ends[0][: N // 2]), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_the_gradient_of_ten_thousand_unknowns_is_the_difference():
+    n = 10**4
+
+    def f(t, y, rate):
+        beside = jnp.concatenate([y[:1], y[:-1]]) + jnp.concatenate([y[1:], y[-1:]])
+        return rate * (1e4 * (beside - 2 * y) - y**3)
+
+    y0 = jnp.cos(jnp.arange(n) / 300.0)
+    finder = diffrax.VeryChord(rtol=1e-13, atol=1e-13, norm=optx.rms_norm)
+
+    @jax.jit
+    def total(rate):
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(f), dfc.Radau(root_finder=finder), 0.0, 1.0, 0.1, y0, rate,
+            stepsize_controller=diffrax.ConstantStepSize(), max_steps=10,
+        )  # fmt: skip
+        return jnp.mean(found.ys[-1] ** 2)
+
+    found = jax.jit(jax.grad(total))(1.0)
+    near, far = ((total(1 + h) - total(1 - h)) / (2 * h) for h in (1e-2, 2e-2))
+    np.testing.assert_allclose(found, (4 * near - far) / 3, rtol=1e-6)
 
 
 def test_sparse_systems_are_used_from_a_size_on():
