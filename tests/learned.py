@@ -23,7 +23,8 @@ def samples(system, keys):
 
 
 def states(count=50, system=LORENZ, seed=7):
-    return samples(system, jr.split(jr.key(seed), count))
+    drawn = samples(system, jr.split(jr.key(seed), max(count, 50)))
+    return jax.tree.map(lambda y: jnp.asarray(np.asarray(y)[:count]), drawn)
 
 
 def flow_map(max_step=0.25, layer=None, seed=0, **options):

@@ -54,7 +54,7 @@ def nearby(**options):
     return wrap(dfx.Tsit5(), ENERGY, **options)
 
 
-# Terms, solver, initial state, and what else `diffeqsolve` is given.
+# Terms, solver, initial state, and what else `diffeqsolve` is given, or what makes them.
 CASES = {
     "plain": (PENDULUM, dfx.Dopri5(), BEGIN),
     "Dopri5": (PENDULUM, wrap(dfx.Dopri5(), ENERGY), BEGIN),
@@ -84,7 +84,8 @@ CASES = {
     "DAE of index 1": (INDEX_1.term, INDEX_1.wrap(dfc.Radau()), (jnp.array(2.0), jnp.array(1.0))),
     "DAE of index 3": (BEAD.term, BEAD.wrap(dfc.Radau()), BEAD0),
     "DAE by Tsit5": (BEAD.term, BEAD.wrap(dfx.Tsit5()), BEAD0),
-    "PINN": (SPRING, wrap(dfc.PINNSolver(turning()), RADIUS), EAST),
+    # Made when it runs: the weights are drawn by dozens of programs.
+    "PINN": lambda: (SPRING, wrap(dfc.PINNSolver(turning()), RADIUS), EAST),
     "DeepONet": (SPRING, dfc.DeepONetSolver(Rotation()), EAST),
     "projected DeepONet": (SPRING, wrap(dfc.DeepONetSolver(Rotation(off=0.1)), RADIUS), EAST),
 }
@@ -100,7 +101,8 @@ OFF = jnp.array([0.0, 0.0, 0.0, jnp.nan])
 
 def observed(case, steps, adjoint, p, size, off):
     """Everything that can be saved, as a PyTree, and whether the solve succeeded."""
-    terms, solver, y0, *options = CASES[case]
+    made = CASES[case]
+    terms, solver, y0, *options = made() if callable(made) else made
     saveat = dfx.SaveAt(
         subs=[dfx.SubSaveAt(t0=True, ts=jnp.array([0.33, 0.7, 1.0])), dfx.SubSaveAt(steps=True)],
         dense=True,
@@ -143,7 +145,7 @@ def derivatives(case, steps, adjoint, size, off):
 
 
 def cases(by_default=None):
-    """Parametrises a law by all cases, of which at most one is not slow: each takes half a minute."""
+    """Parametrises a law by all cases, all slow but one at most: each takes half a minute."""
     pairs = [(case, "adaptive") for case in CASES if case not in FIXED_ONLY]
     pairs += [(case, "fixed") for case in CASES if case not in ADAPTIVE_ONLY]
     marks = {True: (), False: pytest.mark.slow}

@@ -44,10 +44,8 @@ SPHERE = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
 AXIS = jnp.array([0.0, 0.6, 0.8])
 
 
-def brownian(shape=()):
-    return dfx.VirtualBrownianTree(
-        0.0, 1.0, 1e-3, shape, jr.key(0), levy_area=dfx.SpaceTimeTimeLevyArea
-    )
+def brownian(shape=(), levy_area=dfx.SpaceTimeLevyArea):
+    return dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, shape, jr.key(0), levy_area=levy_area)
 
 
 def sde(drift, diffusion):
@@ -72,10 +70,11 @@ ADDITIVE = sde(
     lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
 )
 DIFFERENCE = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
+NOISE = brownian((2,), dfx.SpaceTimeTimeLevyArea)
 # A thermal bead on a circle: the position is constrained.
 LANGEVIN = dfx.MultiTerm(
     dfx.UnderdampedLangevinDriftTerm(jnp.ones(2), jnp.ones(2), lambda x, args: x),
-    dfx.UnderdampedLangevinDiffusionTerm(jnp.ones(2), jnp.ones(2), brownian((2,))),
+    dfx.UnderdampedLangevinDiffusionTerm(jnp.ones(2), jnp.ones(2), NOISE),
 )
 CIRCLE = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
 BODY = kinds.EXPLICIT, kinds.IMPLICIT, kinds.MULTISTEP, kinds.WRAPPER

@@ -56,8 +56,8 @@ def test_bounds():
     """A step of Euler's method that is too long makes an amount negative; the total is one."""
     dae = dfc.DAE(lambda t, x, z, args: -x, algebraic=lambda t, x, z, args: x + z - 1)
     y0, ts = dae.consistent(jnp.array(0.9), jnp.array(0.0)), jnp.array([0.0, 1.5])
-    within = dfc.Newton(lower=0.0)
-    for projection, end in ((None, (-0.45, 1.45)), (within, (0.0, 1.0))):
+    for lower, end in ((-jnp.inf, (-0.45, 1.45)), (0.0, (0.0, 1.0))):
+        projection = dfc.Newton(lower=jnp.asarray(lower))
         solver = dae.wrap(dfx.Euler(), projection=projection)
         found = solve(dae, solver, ts, y0, dt0=1.5)
         assert found.result == dfx.RESULTS.successful

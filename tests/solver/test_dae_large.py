@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 import diffrax_conserve as dfc
 from diffrax_conserve._dae import dae as dae_module
-from diffrax_conserve._dae import search
+from diffrax_conserve._dae import search, stage_systems
 
 pytest.importorskip("asdex")
 pytest.importorskip("klujax")
@@ -118,7 +118,15 @@ def made(make, n, least, monkeypatch):
     return dae, guess, y, structure
 
 
-@pytest.mark.parametrize(("make", "n"), SMALL)
+def of_all_but(*slow):
+    """Of all small equations by default those that are not in `slow`."""
+    marks = {True: pytest.mark.slow, False: ()}
+    cases = [pytest.param(make, n, marks=marks[make in slow]) for make, n in SMALL]
+    return pytest.mark.parametrize(("make", "n"), cases)
+
+
+# The chain takes as long as all others; `test_numbers_known_by_hand` has a long one.
+@of_all_but(chain)
 def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypatch):
     """At a state that is not consistent, with slopes that do not belong to it."""
 
@@ -139,7 +147,8 @@ def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypa
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12, err_msg=str(k))
 
 
-@pytest.mark.parametrize(("make", "n"), [x for x in SMALL if x[0] is not chain])
+# The law before has found the structure of each.
+@of_all_but(explicit, heat, ring, varying, chain)
 def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monkeypatch):
     def values(least):
         dae, guess, *_ = made(make, n, least, monkeypatch)
@@ -187,15 +196,20 @@ def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
     def solved(least):
         monkeypatch.setattr(search, "LEAST_KLU", least)
         monkeypatch.setattr(dae_module, "LEAST_KLU", least)
-        dae, guess = heat(120)
-        y0 = dae.consistent(*guess)
+        monkeypatch.setattr(stage_systems, "LEAST_KLU", least)
+        dae, guess = heat(24)
         steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
-        sol = dfx.diffeqsolve(
-            dae.term, dae.wrap(dfc.Radau()), 0.0, 0.1, 1e-4, y0, stepsize_controller=steps
-        )
-        return sol.ys[-1]
 
-    y = solved(100)
+        @jax.jit
+        def end(y0):
+            return dfx.diffeqsolve(
+                dae.term, dae.wrap(dfc.Radau()), 0.0, 0.1, 1e-4, y0, stepsize_controller=steps,
+                adjoint=dfx.ForwardMode(),
+            ).ys[-1]  # fmt: skip
+
+        return end(dae.consistent(*guess))
+
+    y = np.asarray(solved(20))
     np.testing.assert_allclose(y, solved(10**9), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(y[0] - 1, np.sin(0.1), rtol=1e-13)
     np.testing.assert_allclose(y[-1] - y[-2] ** 3, 0, atol=1e-15)
