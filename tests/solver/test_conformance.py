@@ -11,7 +11,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import OMEGA0, RIGID_BODY, largest, rigid_body
+from ..problems import OMEGA0, RIGID_BODY, TO_THE_END, largest, rigid_body
 from . import conformance_table as kinds
 from .conformance_table import TABLE
 
@@ -34,7 +34,7 @@ def test_the_table_is_complete():
 def solve(terms, manifold, inner, controller, y0):
     """Whether it succeeded, the drift, and how far the state moved."""
     solver, saveat = dfc.ManifoldProjection(inner, manifold), dfx.SaveAt(ts=jnp.linspace(0, 1, 23))
-    options = dict(saveat=saveat, stepsize_controller=controller)
+    options = TO_THE_END | dict(saveat=saveat, stepsize_controller=controller)
     sol = dfx.diffeqsolve(terms, solver, 0.0, 1.0, 0.01, y0, **options)
     moved = jax.tree.map(lambda y, start: jnp.abs(y[-1] - start), sol.ys, y0)
     return sol.result, dfc.drift(sol, manifold), moved
