@@ -119,7 +119,7 @@ def observed(case, steps, adjoint, p, size, off):
         saveat=saveat,
         stepsize_controller=adaptive if steps == "adaptive" else dfx.ConstantStepSize(),
         adjoint=adjoint,
-        max_steps=128,
+        max_steps=128 if steps == "adaptive" else 16,
         throw=False,
         **(options[0] if options else {}),
     )
