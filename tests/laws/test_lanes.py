@@ -54,7 +54,7 @@ def nearby(**options):
     return wrap(dfx.Tsit5(), ENERGY, **options)
 
 
-# Terms, solver, initial state, and what else `diffeqsolve` is given, or what makes them.
+# Terms, solver, initial state, and what else `diffeqsolve` is given.
 CASES = {
     "plain": (PENDULUM, dfx.Dopri5(), BEGIN),
     "Dopri5": (PENDULUM, wrap(dfx.Dopri5(), ENERGY), BEGIN),
@@ -84,8 +84,7 @@ CASES = {
     "DAE of index 1": (INDEX_1.term, INDEX_1.wrap(dfc.Radau()), (jnp.array(2.0), jnp.array(1.0))),
     "DAE of index 3": (BEAD.term, BEAD.wrap(dfc.Radau()), BEAD0),
     "DAE by Tsit5": (BEAD.term, BEAD.wrap(dfx.Tsit5()), BEAD0),
-    # Made when it runs: the weights are drawn by dozens of programs.
-    "PINN": lambda: (SPRING, wrap(dfc.PINNSolver(turning()), RADIUS), EAST),
+    "PINN": (SPRING, wrap(dfc.PINNSolver(turning()), RADIUS), EAST),
     "DeepONet": (SPRING, dfc.DeepONetSolver(Rotation()), EAST),
     "projected DeepONet": (SPRING, wrap(dfc.DeepONetSolver(Rotation(off=0.1)), RADIUS), EAST),
 }
@@ -101,8 +100,7 @@ OFF = jnp.array([0.0, 0.0, 0.0, jnp.nan])
 
 def observed(case, steps, adjoint, p, size, off):
     """Everything that can be saved, as a PyTree, and whether the solve succeeded."""
-    made = CASES[case]
-    terms, solver, y0, *options = made() if callable(made) else made
+    terms, solver, y0, *options = CASES[case]
     saveat = dfx.SaveAt(
         subs=[dfx.SubSaveAt(t0=True, ts=jnp.array([0.33, 0.7, 1.0])), dfx.SubSaveAt(steps=True)],
         dense=True,
