@@ -23,8 +23,7 @@ def samples(system, keys):
 
 
 def states(count=50, system=LORENZ, seed=7):
-    drawn = samples(system, jr.split(jr.key(seed), max(count, 50)))
-    return jax.tree.map(lambda y: jnp.asarray(np.asarray(y)[:count]), drawn)
+    return samples(system, jr.split(jr.key(seed), count))
 
 
 def flow_map(max_step=0.25, layer=None, seed=0, **options):
