@@ -22,7 +22,7 @@ def both(monkeypatch):
 
     def agree(compute, rtol):
         for least in (2, 10**6):
-            monkeypatch.setattr(stage_systems, "LEAST_KLU", least)
+            monkeypatch.setattr(stage_systems, "MIN_KLU", least)
             found = jax.tree.leaves(jax.jit(compute)())
             want = found if least == 2 else want
         for a, b in zip(found, want, strict=True):

@@ -13,7 +13,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._solver.state import units_after
+from diffrax_conserve._solver.state import updated_units
 from diffrax_conserve._tree import ravel
 
 from ..problems import RIGID_BODY, rigid_body
@@ -182,7 +182,7 @@ def test_a_vector_in_a_leaf_is_one_quantity_and_a_component_of_an_array_another(
     def units(start, end):
         zero = jax.tree.map(jnp.zeros_like, start)
         change = jnp.abs(ravel(end) - ravel(start))
-        return units_after(ravel(zero), change, ravel(end), end)
+        return updated_units(ravel(zero), change, ravel(end), end)
 
     eps = np.finfo(float).eps
     of_leaves = units(moved, (place, speed))

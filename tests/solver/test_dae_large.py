@@ -110,8 +110,8 @@ SMALL = [
 
 
 def made(make, n, least, monkeypatch):
-    monkeypatch.setattr(search, "LEAST_KLU", least)
-    monkeypatch.setattr(dae_module, "LEAST_KLU", least)
+    monkeypatch.setattr(search, "MIN_KLU", least)
+    monkeypatch.setattr(dae_module, "MIN_KLU", least)
     dae, guess = make(n)
     y = dae._state(guess)
     structure = dae_module._structure(dae, 0.0, y, None)
@@ -194,7 +194,7 @@ def test_what_is_not_found_is_refused_at_once():
 def test_a_large_solve_is_that_of_scipy(monkeypatch):
     """Heat, whose ends are known from their neighbours, by sparse matrices."""
     for module in (search, dae_module, stage_systems):
-        monkeypatch.setattr(module, "LEAST_KLU", 20)
+        monkeypatch.setattr(module, "MIN_KLU", 20)
     n, t1 = 24, 0.1
     dae, guess = heat(n)
     steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
