@@ -39,15 +39,20 @@ def test_solve_is_that_of_a_dense_matrix(dtype):
     places, values = _places(a)
     b = np.random.default_rng(1).normal(size=60)
     want = np.linalg.solve(a, b)
-    np.testing.assert_allclose(jax.jit(places.solve)(values, b), want, rtol=1e-8)
     x = np.random.default_rng(2).normal(size=60)
-    np.testing.assert_allclose(places.matvec(values, x), a @ x, rtol=1e-12)
     batch = np.stack([b, 2 * b, b[::-1]])
-    found = jax.jit(jax.vmap(places.solve, (None, 0)))(values, batch)
-    np.testing.assert_allclose(found, np.linalg.solve(a, batch.T).T, rtol=1e-8)
-    many = jnp.stack([values, 3 * values])
-    found = jax.vmap(lambda v: jax.vmap(lambda b: places.solve(v, b))(jnp.asarray(batch)))(many)
-    np.testing.assert_allclose(found[1], np.linalg.solve(3 * a, batch.T).T, rtol=1e-8)
+
+    @jax.jit
+    def found(values, b, x, batch):
+        lanes = jax.vmap(places.solve, (None, 0))
+        many = jax.vmap(lambda v: lanes(v, batch))(jnp.stack([values, 3 * values]))
+        return places.solve(values, b), places.matvec(values, x), lanes(values, batch), many
+
+    one, product, several, many = found(values, b, x, batch)
+    np.testing.assert_allclose(one, want, rtol=1e-8)
+    np.testing.assert_allclose(product, a @ x, rtol=1e-12)
+    np.testing.assert_allclose(several, np.linalg.solve(a, batch.T).T, rtol=1e-8)
+    np.testing.assert_allclose(many[1], np.linalg.solve(3 * a, batch.T).T, rtol=1e-8)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.complex128])
@@ -59,17 +64,21 @@ def test_derivatives_are_those_of_a_dense_solve(dtype):
         a = jnp.zeros((12, 12), dtype).at[places.rows, places.columns].set(values)
         return jnp.linalg.solve(a, b)
 
-    def size(solve):
-        return lambda values, b: jnp.sum(jnp.abs(solve(values * values, b)) ** 2)
+    orders = [jax.jacrev]
+    if not np.iscomplexobj(b):
+        orders += [jax.jacfwd, lambda f, n: jax.jacfwd(jax.grad(f, 0), n)]
 
-    for order in (jax.jacfwd, jax.jacrev, lambda f, n: jax.jacfwd(jax.grad(f, 0), n)):
-        if np.iscomplexobj(b) and order is not jax.jacrev:
-            continue
-        for argument in (0, 1):
-            found = order(size(places.solve), argument)(values, b)
-            want = order(size(dense), argument)(values, b)
-            scale = np.max(np.abs(want))
-            np.testing.assert_allclose(found / scale, want / scale, atol=1e-8)
+    @jax.jit
+    def derivatives(values, b):
+        def of(solve):
+            size = lambda values, b: jnp.sum(jnp.abs(solve(values * values, b)) ** 2)  # noqa: E731
+            return [order(size, argument)(values, b) for order in orders for argument in (0, 1)]
+
+        return of(places.solve), of(dense)
+
+    for found, want in zip(*derivatives(values, b), strict=True):
+        scale = np.max(np.abs(want))
+        np.testing.assert_allclose(found / scale, want / scale, atol=1e-8)
 
 
 def _singular(case, n=8):
@@ -112,17 +121,18 @@ def test_a_singular_matrix_gives_nan(factor):
 @pytest.mark.parametrize("case", ["zero row", "equal rows", "three rows in two columns"])
 def test_a_singular_matrix_without_places_for_its_zeros_gives_nan(case):
     places, values = _places(_singular(case))
-    assert np.all(np.isnan(places.solve(values, jnp.ones(places.size))))
+    assert np.all(np.isnan(jax.jit(places.solve)(values, np.ones(places.size))))
 
 
 def test_a_matrix_that_is_not_finite_gives_nan():
     n, rng = 400, np.random.default_rng(0)
     a = np.eye(n) * 4 - np.eye(n, k=1) - np.eye(n, k=20) - np.eye(n, k=-1) - np.eye(n, k=-20)
     places, values = _places(a)
+    solve = jax.jit(places.solve)
     for bad in (np.nan, np.inf):
-        some = jnp.where(rng.random(len(values)) < 0.3, bad, values)
-        for one in (some, some.astype(complex), jnp.full(len(values), bad)):
-            assert np.all(np.isnan(places.solve(one, jnp.ones(n))))
+        some = np.where(rng.random(len(values)) < 0.3, bad, values)
+        for one in (some, some.astype(complex), np.full(len(values), bad)):
+            assert np.all(np.isnan(solve(one, np.ones(n))))
 
 
 def test_an_ill_conditioned_matrix_is_regular():
@@ -130,7 +140,7 @@ def test_an_ill_conditioned_matrix_is_regular():
     a = np.eye(n) - 0.4 * np.eye(n, k=1)
     a[-1, 0] = 1e-11
     places, values = _places(a * 10.0 ** np.linspace(-40, 40, n)[:, None])
-    assert places.is_regular(values)
+    assert jax.jit(places.is_regular)(values)
 
 
 def test_threads_and_loops():
@@ -149,7 +159,7 @@ def test_threads_and_loops():
 
     def run(k):
         for i in range(5):
-            found = looped(values * (1 + k + i), b)
+            found = looped(np.asarray(values) * (1 + k + i), b)
             wrong.append(float(np.max(np.abs(found * (1 + k + i) / want - 1))))
 
     threads = [threading.Thread(target=run, args=(k,)) for k in range(4)]

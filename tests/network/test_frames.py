@@ -49,7 +49,7 @@ SYMMETRIES = {
 @pytest.mark.parametrize("name", [pytest.param("vortices", marks=pytest.mark.slow), "kepler"])
 def test_untrained_it_commutes_with_the_symmetries(name, core, order):
     system, moved, slower, tolerance = SYMMETRIES[name]
-    network, y0s = framed(order, system, core=core), states(10, system, seed=3)
+    network, y0s = framed(order, system, core=core), states(system=system, seed=3)
     step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
     found, expected = step(jax.vmap(moved)(y0s), 0.05 * slower), jax.vmap(moved)(step(y0s, 0.05))
     assert difference(found, expected) < tolerance * (1 + largest(expected))
@@ -57,7 +57,7 @@ def test_untrained_it_commutes_with_the_symmetries(name, core, order):
 
 def test_it_starts_at_its_state_and_keeps_the_centre():
     network = framed(1)
-    y0s = states(10, VORTICES, seed=3)
+    y0s = states(system=VORTICES, seed=3)
     step = jax.jit(jax.vmap(lambda y, h: network(y, h), in_axes=(0, None)))
     np.testing.assert_array_equal(step(y0s, 0.0), y0s)
     slope = jax.jit(jax.jacfwd(lambda h: network(VORTICES.y0, h)))(0.0)

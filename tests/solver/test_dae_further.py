@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
 
-from ..problems import EPS, largest, refused
+from ..problems import EPS, TO_THE_END, largest, refused
 from .test_dae import CUBIC, constant
 
 GRAVITY = 9.81
@@ -20,8 +20,7 @@ GRAVITY = 9.81
 def solve(dae, solver, ts, y0, args=None, *, dt0=None, tol=1e-8, **options):
     """With steps of fixed length if `dt0` is given."""
     steps = dfx.PIDController(rtol=tol, atol=tol) if dt0 is None else dfx.ConstantStepSize()
-    options = dict(max_steps=4096, saveat=dfx.SaveAt(ts=ts), throw=False) | options
-    options |= dict(stepsize_controller=steps)
+    options = TO_THE_END | dict(saveat=dfx.SaveAt(ts=ts), stepsize_controller=steps) | options
     return dfx.diffeqsolve(dae.term, solver, ts[0], ts[-1], dt0, y0, args, **options)
 
 
@@ -34,18 +33,16 @@ CLOCK = dfc.FirstIntegral(lambda t, y, a: 1.5 * y[1] ** 2 + jnp.log(y[1]) + a * 
 def test_an_integral_of_an_algebraic_unknown():
     """At saved times too, and its derivatives, by long steps of a method of order two."""
     ts = jnp.linspace(0, 1, 7)
-    options = dict(dt0=0.25, adjoint=dfx.ForwardMode())
     solver = CUBIC.wrap(dfx.Heun(), CLOCK)
 
-    @jax.jit
-    def both(z0, a):
-        end = lambda *p: solve(CUBIC, solver, ts, (p[0] ** 3 + p[0], p[0]), p[1], **options)  # noqa: E731
-        slopes = jax.jacfwd(lambda *p: end(*p).ys[1][-1], (0, 1))(z0, a)
-        return end(z0, a), slopes
+    def end(z0, a):
+        found = solve(CUBIC, solver, ts, (z0**3 + z0, z0), a, dt0=0.25)
+        return found.ys[1][-1], (found.ys, found.result)
 
-    found, (by_z0, by_a) = both(jnp.array(1.0), jnp.array(0.7))
-    assert found.result == dfx.RESULTS.successful
-    x, z = map(np.asarray, found.ys)
+    both = jax.jit(jax.jacfwd(end, (0, 1), has_aux=True))
+    (by_z0, by_a), (ys, result) = both(jnp.array(1.0), jnp.array(0.7))
+    assert result == dfx.RESULTS.successful
+    x, z = map(np.asarray, ys)
     assert largest(x - z**3 - z) < 8 * EPS
     assert largest(constant(np.asarray(ts), z, 0.7) - constant(0, 1.0, 0.7)) < 16 * EPS
     slope = lambda z: 3 * z + 1 / z  # noqa: E731
@@ -56,8 +53,8 @@ def test_bounds():
     """A step of Euler's method that is too long makes an amount negative; the total is one."""
     dae = dfc.DAE(lambda t, x, z, args: -x, algebraic=lambda t, x, z, args: x + z - 1)
     y0, ts = dae.consistent(jnp.array(0.9), jnp.array(0.0)), jnp.array([0.0, 1.5])
-    within = dfc.Newton(lower=0.0)
-    for projection, end in ((None, (-0.45, 1.45)), (within, (0.0, 1.0))):
+    for lower, end in ((-jnp.inf, (-0.45, 1.45)), (0.0, (0.0, 1.0))):
+        projection = dfc.Newton(lower=jnp.asarray(lower))
         solver = dae.wrap(dfx.Euler(), projection=projection)
         found = solve(dae, solver, ts, y0, dt0=1.5)
         assert found.result == dfx.RESULTS.successful

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
 from diffrax_conserve._dae import dae as dae_module
-from diffrax_conserve._dae import search
+from diffrax_conserve._dae import search, stage_systems
 
 pytest.importorskip("asdex")
 pytest.importorskip("klujax")
@@ -118,7 +119,15 @@ def made(make, n, least, monkeypatch):
     return dae, guess, y, structure
 
 
-@pytest.mark.parametrize(("make", "n"), SMALL)
+def of_all_but(*slow):
+    """Of all small equations by default those that are not in `slow`."""
+    marks = {True: pytest.mark.slow, False: ()}
+    cases = [pytest.param(make, n, marks=marks[make in slow]) for make, n in SMALL]
+    return pytest.mark.parametrize(("make", "n"), cases)
+
+
+# The chain takes as long as all others; `test_numbers_known_by_hand` has a long one.
+@of_all_but(chain)
 def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypatch):
     """At a state that is not consistent, with slopes that do not belong to it."""
 
@@ -139,7 +148,8 @@ def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypa
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12, err_msg=str(k))
 
 
-@pytest.mark.parametrize(("make", "n"), [x for x in SMALL if x[0] is not chain])
+# The law before has found the structure of each.
+@of_all_but(explicit, heat, ring, varying, chain)
 def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monkeypatch):
     def values(least):
         dae, guess, *_ = made(make, n, least, monkeypatch)
@@ -181,21 +191,28 @@ def test_what_is_not_found_is_refused_at_once():
     assert time.monotonic() - begin < 60
 
 
-def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
-    """Heat and a ladder of diodes, to the tolerance of the solve."""
+def test_a_large_solve_is_that_of_scipy(monkeypatch):
+    """Heat, whose ends are known from their neighbours, by sparse matrices."""
+    for module in (search, dae_module, stage_systems):
+        monkeypatch.setattr(module, "MIN_KLU", 20)
+    n, t1 = 24, 0.1
+    dae, guess = heat(n)
+    steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
 
-    def solved(least):
-        monkeypatch.setattr(search, "MIN_KLU", least)
-        monkeypatch.setattr(dae_module, "MIN_KLU", least)
-        dae, guess = heat(120)
-        y0 = dae.consistent(*guess)
-        steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
-        sol = dfx.diffeqsolve(
-            dae.term, dae.wrap(dfc.Radau()), 0.0, 0.1, 1e-4, y0, stepsize_controller=steps
-        )
+    @jax.jit
+    def end(y0):
+        options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode())
+        sol = dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, t1, 1e-4, y0, **options)
         return sol.ys[-1]
 
-    y = solved(100)
-    np.testing.assert_allclose(y, solved(10**9), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(y[0] - 1, np.sin(0.1), rtol=1e-13)
+    y0 = dae.consistent(*guess)
+    y = np.asarray(end(y0))
+
+    def slope(t, u):
+        whole = np.concatenate([[1 + np.sin(t)], u, u[-1:] ** 3])
+        return np.diff(whole, 2) * n**2 + u * (1 - u)
+
+    exact = solve_ivp(slope, (0, t1), y0[1:-1], "Radau", rtol=1e-10, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(y[1:-1], exact, rtol=1e-6)
+    np.testing.assert_allclose(y[0] - 1, np.sin(t1), rtol=1e-13)
     np.testing.assert_allclose(y[-1] - y[-2] ** 3, 0, atol=1e-15)

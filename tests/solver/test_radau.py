@@ -12,7 +12,7 @@ from scipy.special import ellipj
 
 import diffrax_conserve as dfc
 
-from ..problems import EPS, largest, refused
+from ..problems import EPS, TO_THE_END, largest, refused
 from ..test_benchmarks import benchmark
 
 
@@ -20,8 +20,8 @@ from ..test_benchmarks import benchmark
 def solve(term, solver, t1, y0, args, tol, *, scale=1.0, saveat=dfx.SaveAt(t1=True)):
     controller = dfx.PIDController(rtol=tol, atol=tol * scale)
     return dfx.diffeqsolve(
-        term, solver, 0.0, t1, 1e-6, y0, args, stepsize_controller=controller, max_steps=10_000,
-        saveat=saveat, throw=False,
+        term, solver, 0.0, t1, 1e-6, y0, args, stepsize_controller=controller, saveat=saveat,
+        **TO_THE_END,
     )  # fmt: skip
 
 
