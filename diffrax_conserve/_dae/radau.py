@@ -18,7 +18,7 @@ from .._numerics.implicit import root
 from .._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from .._options import check_counts
 from .._projection.options import check_state, option
-from .._solver.terms import time_direction, vector_fields
+from .._solver.terms import in_field_time, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, unravel
 from .stage_systems import systems_at
@@ -146,10 +146,11 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         solver_state: _Last,
         made_jump: BoolScalarLike,
     ) -> tuple[Y, Y, DenseInfo, _Last, dfx.RESULTS]:
+        terms, t0, t1 = in_field_time(terms, t0, t1)
         start = ravel(y0)
         nodes, inverse = jnp.asarray(_NODES, start.dtype), jnp.asarray(_INVERSE, start.dtype)
         length = nonzero_length(t0, t1).astype(start.dtype)
-        residual = self._residual(terms, t0, y0, args)
+        residual = self._residual(terms, y0, args)
         at_stages = jax.vmap(residual)
         # The polynomial of the last step is continued.
         last = lax.stop_gradient(solver_state)
@@ -230,16 +231,14 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
         return terms.vf(t0, y0, args)
 
-    def _residual(self, terms: Any, t0: RealScalarLike, y0: Y, args: Args) -> Any:
-        """The equations as a function of the time of the solver and of vectors."""
-        direction = time_direction(terms, t0)
+    def _residual(self, terms: Any, y0: Y, args: Args) -> Any:
+        """The equations as a function of time and of vectors."""
 
         def residual(t: Array, y: Array, slope: Array) -> Array:
+            state = unravel(y, y0)
             if self._equations is None:
-                k = ravel(terms.vf(t, unravel(y, y0), args)).astype(y.dtype)
-                return slope - direction.astype(y.dtype) * k
-            rate = unravel(direction.astype(y.dtype) * slope, y0)
-            return ravel(self._equations(direction * t, unravel(y, y0), rate, args)).astype(y.dtype)
+                return slope - ravel(terms.vf(t, state, args)).astype(y.dtype)
+            return ravel(self._equations(t, state, unravel(slope, y0), args)).astype(y.dtype)
 
         return residual
 
