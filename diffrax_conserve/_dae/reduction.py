@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import REGULARISATION_POWER
+from .._fast.arrays import folded
 from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import without_pattern
@@ -150,7 +151,7 @@ class Reduction:
             self.constraints = self.small(self._further(k), t, y)
 
     def small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
-        return fn if self.structure.large is not None else small(fn, *like)
+        return (small if self.structure.large is None else folded)(fn, *like)
 
     def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
         """The constraints with those of round `k`. The first are the equations that are left at the
