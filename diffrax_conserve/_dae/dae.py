@@ -20,7 +20,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._constants import LEAST_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
-from .._large.klu import sparse_jacobian
 from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
@@ -34,7 +33,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_nothing
-from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
+from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
 from .newton import (
@@ -631,8 +630,7 @@ class ConstraintProjection(AbstractProjection):
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.
-        ok = settled | tree_stop_gradient(problem).holds(lax.stop_gradient(y))
-        return y, problem.report(candidate, y, ok=ok)
+        return y, problem.report(candidate, y, settled=settled)
 
 
 @eqx.filter_jit
@@ -689,12 +687,11 @@ def _solved_for(
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
     residual = reduction.small(residual, y[free])
-    is_large = structure.large is not None and free.size >= LEAST_KLU
-    jacobian = sparse_jacobian(residual, y[free]) if is_large else None
-    if jacobian is None:
+    large = structure.large
+    if large is None or large.by_free is None or free.size < LEAST_KLU:
         found = root(residual, ft.partial(newton, residual), y[free], divided)
     else:
-        sparse = SparseNewton(jacobian)
+        sparse = SparseNewton(large.by_free)
         newton = ft.partial(newton, residual, sparse=sparse)
         found = root(residual, newton, y[free], sparse.solve, sparse.jacobian)
     return moved(found.y), found.ok & jnp.asarray(False if found.more is None else found.more)

@@ -70,8 +70,11 @@ def find_large_structure(
     indices."""
     n = y.size
     places = _Places(numbers, unknown)
-    by_slope, by_y = places.of(equations, 2, n), places.of(equations, 1, n)
-    t, y, values, is_linear, absent = _general_position(equations, by_y, by_slope, numbers, t, y)
+    by_y = places.of(equations, 1, n)
+    by_slope = _jacobian(mass) if mass is not None else places.of(equations, 2, n)
+    t, y, of_y, values, is_linear, absent = _general_position(
+        equations, by_y, by_slope, numbers, t, y
+    )
     matrix = other = _matrix(by_slope, values)
     if mass is None:
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
@@ -97,9 +100,14 @@ def find_large_structure(
             raise NotFound(f"their index is larger than {MAX_INDEX}")
         structure = _with_round(structure, selected, matrix, needed)
         left = np.array(structure.left(structure.index - 1), int)
-        last = _Last(equations, structure)
-        of_last = places.of(last.constraints, 1, n)
-        new = _matrix(of_last, last.values(of_last, numbers, t, y))
+        if structure.index == 1:  # the derivatives of equations, or of combinations of them
+            share = _combined(structure)
+            at, new = _jacobian(abs(share) @ _ones(by_y)), sp.csr_array(share @ _matrix(by_y, of_y))
+            new.eliminate_zeros()
+        else:
+            last = _Last(equations, structure)
+            at = places.of(last.constraints, 1, n)
+            new = _matrix(at, last.values(at, numbers, t, y))
         contained = ~_empty(new, 0)
         brought.append(np.flatnonzero(contained & ~seen))
         met.append(len(extended(new[:, brought[-1]], (none, none))[0]) == len(left))
@@ -111,16 +119,20 @@ def find_large_structure(
             blamed = left[~np.isin(start + np.arange(len(left)), independent)]
             raise Singular(_tuple(blamed), absent)
         matrix = _replaced(matrix, left, new)
-        needed = np.unique(of_last.columns)
+        needed = np.unique(at.columns)
         kept = ~np.isin(in_places[0], left)
-        added = left[of_last.rows], of_last.columns
+        added = left[at.rows], at.columns
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
     for_slopes = SparseJacobian(*in_places, (n, n))
     large = dataclasses.replace(structure.large, for_slopes=for_slopes)  # pyright: ignore
     structure = dataclasses.replace(structure, large=large)
-    if structure.index == 1 and large.along is None:
-        raise NotFound("the coefficients of their slopes are coupled, and not constant")
+    if structure.index == 1:
+        if large.along is None:
+            raise NotFound("the coefficients of their slopes are coupled, and not constant")
+        moved = abs(_combined(structure)) @ _ones(by_y) @ abs(large.along.matrix)
+        large = dataclasses.replace(large, by_free=_jacobian(moved))
+        structure = dataclasses.replace(structure, large=large)
     if all(met):
         structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
     return structure
@@ -139,6 +151,25 @@ def _matrix(places: SparseJacobian, values: Any) -> sp.csr_array:
     out = sp.csr_array((np.asarray(values), (places.rows, places.columns)), places.shape)
     out.eliminate_zeros()
     return out
+
+
+def _jacobian(pattern: sp.csr_array) -> SparseJacobian:
+    """The places of the elements of a matrix."""
+    rows, columns = sp.coo_array(pattern).coords
+    return SparseJacobian(rows, columns, pattern.shape)
+
+
+def _ones(places: SparseJacobian) -> sp.csr_array:
+    return sp.csr_array((np.ones(len(places.rows)), (places.rows, places.columns)), places.shape)
+
+
+def _combined(structure: Structure) -> sp.csr_array:
+    """The combinations of the equations that are left first."""
+    large, left = structure.large, np.array(structure.left(0), int)
+    if large.combinations is not None:
+        return large.combinations.matrix
+    at = np.arange(len(left)), left
+    return sp.csr_array((np.ones(len(left)), at), (len(left), structure.size))
 
 
 def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.csr_array:
@@ -342,11 +373,11 @@ def _general_position(
     numbers: Numbers,
     t: Array,
     y: Array,
-) -> tuple[Array, Array, Array, bool, tuple[int, ...]]:
+) -> tuple[Array, Array, Array, Array, bool, tuple[int, ...]]:
     for share in (1e-1, 1e-3, 1e-5, 0.0):
         found = _near(equations, by_y, by_slope, numbers, t, y, share)
         later, moved, of_y, values, is_linear, finite = found
         if finite:
             absent = _empty(_matrix(by_y, of_y), 0) & _empty(_matrix(by_slope, values), 0)
-            return later, moved, values, bool(is_linear), _tuple(np.flatnonzero(absent))
+            return later, moved, of_y, values, bool(is_linear), _tuple(np.flatnonzero(absent))
     raise FloatingPointError

@@ -9,6 +9,7 @@ kept, an operation with zero is none, and equal operations are one.
 """
 
 import functools as ft
+import itertools as it
 from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any, NamedTuple
@@ -28,7 +29,9 @@ _PIECES = 8
 # An operation is done piece by piece if this share of one of its arrays is a single number.
 _SHARE = 1 / 16
 # With zeros alone these give zeros.
-_LINEAR = frozenset("cumsum gather reduce_sum rev reduce_max reduce_min transpose".split())
+_LINEAR = frozenset(
+    ["cumsum", "gather", "reduce_max", "reduce_min", "reduce_sum", "rev", "transpose"]
+)
 
 Shape = tuple[int, ...]
 
@@ -198,9 +201,7 @@ class _Program:
             return self.concatenated(
                 [self.reshaped(j, (prod(self.values[j].shape),)) for j in x.row], 0
             )
-        return self.operation(
-            ("reshape",), shape, x.dtype, lambda x: lax.reshape(x, shape), (i,)
-        )
+        return self.operation(("reshape",), shape, x.dtype, lambda x: lax.reshape(x, shape), (i,))
 
     # ---- Equations ----
 
@@ -280,8 +281,9 @@ class _Program:
         """An operation on elements, piece by piece where an array is a single number in many of its
         places."""
         xs = [self.values[i] for i in row]
-        shape = max((x.shape for x in xs), key=len)
-        if len(shape) == 1 and any(self._has_numbers(x) for x in xs):
+        shape = np.broadcast_shapes(*(x.shape for x in xs))
+        same = all(x.shape in ((), shape) for x in xs)
+        if len(shape) == 1 and same and any(self._has_numbers(x) for x in xs):
             ends = {0, *shape}
             for x in xs:
                 if x.what == ("concatenate", 0):
@@ -290,7 +292,7 @@ class _Program:
             if len(bounds) <= 2 * _PIECES:
                 parts = [
                     self._simpler(name, fn, what, [self.piece(i, a, b) for i in row], dtype)
-                    for a, b in zip(bounds, bounds[1:], strict=False)
+                    for a, b in it.pairwise(bounds)
                 ]
                 return self.concatenated(parts, 0)
         return self._simpler(name, fn, what, row, dtype)
@@ -303,9 +305,9 @@ class _Program:
         return any(p.number is not None and p.shape[0] >= _SHARE * x.shape[0] for p in pieces)
 
     def _simpler(self, name: str, fn: Any, what: Any, row: Sequence[int], dtype: Any) -> int:
-        """The result of an operation on elements, by a simpler one or by none where that will do."""
+        """The result of an operation on elements, by a simpler one or by none if that will do."""
         xs = [self.values[i] for i in row]
-        shape = max((x.shape for x in xs), key=len)
+        shape = np.broadcast_shapes(*(x.shape for x in xs))
         apply = lambda name, i: self._simpler(name, getattr(lax, name), (name, ()), [i], dtype)  # noqa: E731
         if name in KNOWN and all(x.number is not None for x in xs):
             with np.errstate(all="ignore"):
@@ -317,7 +319,9 @@ class _Program:
                 return self.concatenated([apply("neg", i) for i in xs[0].row], xs[0].what[1])
             case "neg" if xs[0].what[0] == "reshape":
                 return self.reshaped(apply("neg", xs[0].row[0]), shape)
-            case "select_n" if xs[0].number is not None:
+            case "select_n" if (
+                xs[0].number is not None and xs[1 + int(xs[0].number)].shape == shape
+            ):
                 return row[1 + int(xs[0].number)]
             case "div" if _is(xs[0], 0):
                 return self.full(0, shape, dtype)
