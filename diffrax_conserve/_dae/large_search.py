@@ -13,7 +13,7 @@ can not do is refused with its reason, before it takes long.
 import contextlib
 import dataclasses
 import functools as ft
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -64,14 +64,24 @@ def find_large_structure(
     y: Array,
     mass: sp.csr_array | None,
     unknown: tuple[int, ...],
+    memory: dict[Any, Any],
     known: Structure | None = None,
 ) -> Structure:
     """As `find_structure`. `unknown` are the numbers that may have any values, also where they are
-    indices."""
+    indices. `memory` holds what does not depend on the numbers, for the next search."""
+
+    def once(key: Any, find: Callable[[], Any]) -> Any:
+        if key not in memory:
+            memory[key] = find()
+        return memory[key]
+
     n = y.size
     places = _Places(numbers, unknown)
-    by_y = places.of(equations, 1, n)
-    by_slope = _jacobian(mass) if mass is not None else places.of(equations, 2, n)
+    by_y = once("by_y", lambda: places.of(equations, 1, n))
+    by_slope = once(
+        "by_slope",
+        lambda: places.of(equations, 2, n) if mass is None else _jacobian(mass),
+    )
     t, y, of_y, values, is_linear, absent = _general_position(
         equations, by_y, by_slope, numbers, t, y
     )
@@ -98,7 +108,10 @@ def find_large_structure(
             selected = tuple(np.array(x, int) for x in before[0])
         if structure.index == MAX_INDEX:
             raise NotFound(f"their index is larger than {MAX_INDEX}")
-        structure = _with_round(structure, selected, matrix, needed)
+        rounds = *structure.rounds, Round(*map(_tuple, selected))
+        key = rounds, structure.is_linear, structure.mass is None, structure.apart
+        found = ft.partial(_with_round, structure, selected, matrix, needed)
+        structure = dataclasses.replace(structure, rounds=rounds, large=once(key, found))
         left = np.array(structure.left(structure.index - 1), int)
         if structure.index == 1:  # the derivatives of equations, or of combinations of them
             share = _combined(structure)
@@ -106,7 +119,7 @@ def find_large_structure(
             new.eliminate_zeros()
         else:
             last = _Last(equations, structure)
-            at = places.of(last.constraints, 1, n)
+            at = once(last, ft.partial(places.of, last.constraints, 1, n))
             new = _matrix(at, last.values(at, numbers, t, y))
         contained = ~_empty(new, 0)
         brought.append(np.flatnonzero(contained & ~seen))
@@ -124,15 +137,9 @@ def find_large_structure(
         added = left[at.rows], at.columns
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
-    for_slopes = SparseJacobian(*in_places, (n, n))
-    large = dataclasses.replace(structure.large, for_slopes=for_slopes)  # pyright: ignore
+    key = structure.rounds, structure.is_linear, structure.mass is None, "last"
+    large = once(key, lambda: _with_slopes(structure, by_y, in_places))
     structure = dataclasses.replace(structure, large=large)
-    if structure.index == 1:
-        if large.along is None:
-            raise NotFound("the coefficients of their slopes are coupled, and not constant")
-        moved = abs(_combined(structure)) @ _ones(by_y) @ abs(large.along.matrix)
-        large = dataclasses.replace(large, by_free=_jacobian(moved))
-        structure = dataclasses.replace(structure, large=large)
     if all(met):
         structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
     return structure
@@ -188,9 +195,9 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 
 def _with_round(
     structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
-) -> Structure:
-    """The structure with one more round, of which the slopes that the constraints before it contain
-    are needed."""
+) -> Large:
+    """What one more round needs, of which the slopes that the constraints before it contain are
+    needed."""
     rows, columns = selected
     large, k = structure.large, structure.index
     assert large is not None
@@ -204,9 +211,8 @@ def _with_round(
     constant = structure.is_linear and structure.mass is not None
     if k == 0:
         large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
-        structure = dataclasses.replace(structure, large=large)
         if structure.apart:
-            return structure
+            return large
         if not constant:
             raise NotFound(
                 "equations without slopes are combinations of others, and the coefficients of "
@@ -216,8 +222,7 @@ def _with_round(
         share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
         whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
         whole = whole - _spread(share, None, rows, structure.size)
-        large = dataclasses.replace(large, combinations=SparseMatrix(whole))
-        return dataclasses.replace(structure, large=large)
+        return dataclasses.replace(large, combinations=SparseMatrix(whole))
     needed = np.intersect1d(needed, columns)
     if constant and given.size == rows.size:
         at = np.searchsorted(np.sort(columns), needed)
@@ -232,8 +237,21 @@ def _with_round(
         one = Elimination(SparseMatrix(_spread(-inverse, needed, rows, structure.size)))
     else:
         one = Elimination(levels=_levels(matrix, rows, columns, needed))
-    large = dataclasses.replace(large, eliminations=(*large.eliminations, one))
-    return dataclasses.replace(structure, large=large)
+    return dataclasses.replace(large, eliminations=(*large.eliminations, one))
+
+
+def _with_slopes(
+    structure: Structure, by_y: SparseJacobian, in_places: tuple[np.ndarray, np.ndarray]
+) -> Large:
+    """What the equations need after the last round."""
+    n, large = structure.size, structure.large
+    large = dataclasses.replace(large, for_slopes=SparseJacobian(*in_places, (n, n)))
+    if structure.index != 1:
+        return large
+    if large.along is None:
+        raise NotFound("the coefficients of their slopes are coupled, and not constant")
+    moved = abs(_combined(structure)) @ _ones(by_y) @ abs(large.along.matrix)
+    return dataclasses.replace(large, by_free=_jacobian(moved))
 
 
 def _along(
