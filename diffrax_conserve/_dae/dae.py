@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._constants import LEAST_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._fast.run_once import run_once
 from .._hashable import Hashable
 from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
@@ -267,9 +268,11 @@ class DAE(Hashable):
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
             "the equations that are differentiated."
         )
-        if eqx.is_array(ok) and not isinstance(ok, jax.core.Tracer) and not ok:
+        if isinstance(ok, jax.core.Tracer):
+            return eqx.error_if(found, ~ok, message)
+        if not ok:
             raise ValueError(message)
-        return eqx.error_if(found, ~ok, message)
+        return found
 
     def report(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
         """What was found out about the equations, at the state of a guess.
@@ -294,7 +297,7 @@ class DAE(Hashable):
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
         times = structure.times
-        off = eqx.filter_jit(_Constraints(self))(t, y, args)[: structure.index]
+        off = run_once(eqx.filter_jit)(_Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
@@ -633,7 +636,7 @@ class ConstraintProjection(AbstractProjection):
         return y, problem.report(candidate, y, settled=settled)
 
 
-@eqx.filter_jit
+@run_once(eqx.filter_jit)
 def _consistent(
     dae: DAE, t: Array, y: Y, args: Args, moves: Bool[np.ndarray, " n"] | None
 ) -> tuple[Y, Bool[Array, ""]]:
