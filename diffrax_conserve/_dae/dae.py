@@ -260,9 +260,10 @@ class DAE(Hashable):
         """
         y = self._state(guess)
         _checked_structure(self, t, y, args)
+        is_traced = _is_traced(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         moves = None if fixed is None else ~_flags(fixed, y)
-        found, ok = _consistent(self, t, y, args, moves)
+        found, ok = (_consistent.inside if is_traced else _consistent)(self, t, y, args, moves)
         message = (
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
@@ -327,12 +328,12 @@ class DAE(Hashable):
         As `consistent`, and `TypeError` where JAX traces.
         """
         y = self._state(guess)
-        search = _search(self, y, args)
-        if search.is_traced or any_traced((self, t, y, args)):
+        if _is_traced(self, t, y, args):
             raise TypeError(
                 "`at` of a `DAE` finds its structure from numbers, but JAX traces them here: call "
                 "it outside of `jax.jit` and the like."
             )
+        search = _search(self, y, args)
         found = _found(self, t, y, args, lambda: search.at((self, args), *_numbers(t, y)))
         return dataclasses.replace(self, structure=found)
 
@@ -485,11 +486,9 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
 def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
     """The structure; raises if the equations have another one with the numbers that are given."""
     structure = _structure(dae, t, y, args)
-    if dae.structure is not None or any_traced((dae, t, y, args)):
+    if dae.structure is not None or _is_traced(dae, t, y, args):
         return structure
     search = _search(dae, y, args)
-    if search.is_traced:
-        return structure
 
     def near() -> Structure:
         try:
@@ -506,6 +505,14 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
             "`wrap` of that."
         )
     return structure
+
+
+def _is_traced(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> bool:
+    """Whether JAX traces one of these, what the functions close over, or a function around this
+    call, in which each operation gives a tracer."""
+    if any_traced((dae, t, y, args, jnp.zeros(()) + 0)):
+        return True
+    return dae.structure is None and _search(dae, y, args).is_traced
 
 
 def _search(dae: DAE, y: Y, args: Args) -> Search:

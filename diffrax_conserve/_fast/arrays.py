@@ -21,7 +21,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .jaxprs import outputs, walk
+from .jaxprs import num_equations, outputs, walk
 from .scalars import BY_INDICES, ELEMENTWISE, KNOWN, MOVES, moved_elements
 
 # A choice of so many pieces at most is made of slices, not by indices.
@@ -37,7 +37,8 @@ Shape = tuple[int, ...]
 
 
 def folded(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[Array]]:
-    """`fn`, a function of arrays like these, without what it computes twice or in vain.
+    """`fn`, a function of arrays like these, without what it computes twice or in vain; `fn` itself
+    if that is no smaller.
 
     A product with the number zero is zero here, also where the other factor is infinite.
     """
@@ -49,7 +50,9 @@ def folded(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree
         results = walk(closed, given, program.constant, program.equation)
     except _NotFolded:
         return fn
-    evaluate = program.evaluation(len(given), results)
+    evaluate, size = program.evaluation(len(given), results)
+    if size > num_equations(closed):
+        return fn
     return lambda *args: out_treedef.unflatten(evaluate(treedef.flatten_up_to(args)))
 
 
@@ -86,8 +89,11 @@ class _Program:
             self.values.append(_Value(what, tuple(shape), dtype, fn, tuple(row), **more))
         return self.positions[key]
 
-    def evaluation(self, count: int, results: list[int]) -> Callable[[list[Any]], list[Any]]:
-        """The results as a function of the first values, which are given."""
+    def evaluation(
+        self, count: int, results: list[int]
+    ) -> tuple[Callable[[list[Any]], list[Any]], int]:
+        """The results as a function of the first values, which are given, and the number of its
+        operations."""
         needed, rest = set(), [*results]
         while rest:
             i = rest.pop()
@@ -104,7 +110,7 @@ class _Program:
                 found[i] = fn(*(found[j] for j in values[i].row))
             return [found[i] for i in results]
 
-        return evaluate
+        return evaluate, sum(bool(values[i].row or values[i].shape) for i in order)
 
     # ---- Values ----
 
@@ -260,10 +266,10 @@ class _Program:
         ]
 
     def _split(self, i: int, sizes: Sequence[int], axis: int) -> list[int]:
-        shape, ends = self.values[i].shape, np.cumsum(sizes).tolist()
+        shape, ends = self.values[i].shape, it.accumulate(map(int, sizes))
         low, high, parts = [0] * len(shape), [*shape], []
         for size, end in zip(sizes, ends, strict=True):
-            low[axis], high[axis] = end - size, end
+            low[axis], high[axis] = end - int(size), end
             parts.append(self.sliced(i, low, high))
         return parts
 

@@ -5,31 +5,25 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax._src.core as private
 
 # XLA's older emitters, and none of LLVM's optimisations: a third to a fifth of the time to compile.
 _QUICKLY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 
 
-def run_once(jit: Callable[..., Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator: the function under this `jit`, compiled quickly where that is possible. JAX
-    takes options for the outermost `jit` alone."""
+class RunOnce:
+    """A function under this `jit`, compiled quickly where that is possible. JAX takes options for
+    the outermost `jit` alone: where it traces already, call `inside`."""
 
-    def decorate(fn: Callable[..., Any]) -> Callable[..., Any]:
-        usual, quick = jit(fn), jit(fn, compiler_options=_QUICKLY)
+    def __init__(self, jit: Callable[..., Any], fn: Callable[..., Any]):
+        self.inside, self._quick = jit(fn), jit(fn, compiler_options=_QUICKLY)
 
-        @ft.wraps(fn)
-        def call(*args: Any) -> Any:
-            return (quick if _is_outermost() and _knows_options() else usual)(*args)
-
-        return call
-
-    return decorate
+    def __call__(self, *args: Any) -> Any:
+        return (self._quick if _knows_options() else self.inside)(*args)
 
 
-def _is_outermost() -> bool:
-    """Whether JAX traces nothing here. There is no public name for that."""
-    return getattr(private, "trace_state_clean", lambda: False)()
+def run_once(jit: Callable[..., Any]) -> Callable[[Callable[..., Any]], RunOnce]:
+    """`RunOnce` as a decorator."""
+    return ft.partial(RunOnce, jit)
 
 
 @ft.cache

@@ -151,6 +151,33 @@ def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monke
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize(("make", "n"), [(pairs, 60), (chain, 24)])
+def test_consistent_states_of_a_higher_index_are_those_of_dense_matrices(make, n, monkeypatch):
+    """With 120 unknowns, index 2 and 3; and inside of another program."""
+
+    def values(least):
+        dae, _, y, structure = made(make, n, least, monkeypatch)
+        moved = jax.tree.map(lambda x: x + 0.1 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), y)
+        state = dae.consistent(moved)
+        inside = None if least else jax.jit(lambda: dae.consistent(moved))()
+        constraints = dae_module._Constraints(dae)
+        return (
+            structure.ranks,
+            (state, constraints(0.0, moved, None)),
+            inside,
+            constraints(0.0, state, None),
+        )
+
+    (ranks, dense, *_), (same, large, inside, zeros) = values(10**9), values(0)
+    assert ranks == same
+    for a, b in zip(jax.tree.leaves(dense), jax.tree.leaves(large), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    for a, b in zip(jax.tree.leaves(large[0]), jax.tree.leaves(inside), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    for h in zeros:
+        np.testing.assert_allclose(h, 0, atol=1e-11)
+
+
 @pytest.mark.parametrize(
     ("make", "n", "index", "freedom"),
     [
