@@ -76,13 +76,14 @@ def find_large_structure(
             memory[key] = find()
         return memory[key]
 
+    def found() -> Large:
+        given = places.of(equations, 2, n) if mass is None else _jacobian(mass)
+        return Large(places.of(equations, 1, n), given)
+
     n = y.size
     places = _Places(numbers, unknown)
-    by_y = once("by_y", lambda: places.of(equations, 1, n))
-    by_slope = once(
-        "by_slope",
-        lambda: places.of(equations, 2, n) if mass is None else _jacobian(mass),
-    )
+    large = once("places", found)
+    by_y, by_slope = large.by_y, large.by_slope
     t, y, of_y, values, is_linear, absent = _general_position(
         equations, by_y, by_slope, numbers, t, y
     )
@@ -98,7 +99,7 @@ def find_large_structure(
     apart = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
     structure = Structure(
-        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=Large(by_y, by_slope)
+        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=large
     )
     seen, brought, met, needed = np.zeros(n, bool), [], [], none
     in_places = by_slope.rows, by_slope.columns
@@ -109,10 +110,11 @@ def find_large_structure(
             selected = tuple(np.array(x, int) for x in before[0])
         if structure.index == MAX_INDEX:
             raise NotFound(f"their index is larger than {MAX_INDEX}")
-        rounds = *structure.rounds, Round(*map(_tuple, selected))
-        key = rounds, structure.is_linear, structure.mass is None, structure.apart
-        found = ft.partial(_with_round, structure, selected, matrix, needed)
-        structure = dataclasses.replace(structure, rounds=rounds, large=once(key, found))
+        one = Round(*map(_tuple, selected))
+        kind = structure.is_linear, structure.mass is None, structure.apart, _pattern(matrix)
+        further = ft.partial(_with_round, structure, selected, matrix, needed)
+        large = once((structure, one, *kind), further)
+        structure = dataclasses.replace(structure, rounds=(*structure.rounds, one), large=large)
         left = np.array(structure.left(structure.index - 1), int)
         if structure.index == 1:  # the derivatives of equations, or of combinations of them
             share = _combined(structure)
@@ -138,8 +140,7 @@ def find_large_structure(
         added = left[at.rows], at.columns
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
-    key = structure.rounds, structure.is_linear, structure.mass is None, "last"
-    large = once(key, lambda: _with_slopes(structure, by_y, in_places))
+    large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
     structure = dataclasses.replace(structure, large=large)
     if all(met):
         structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
@@ -153,6 +154,11 @@ def _tuple(x: np.ndarray) -> tuple[int, ...]:
 def _empty(matrix: sp.csr_array, axis: int) -> np.ndarray:
     """Which columns, or rows, have no element."""
     return np.bincount(sp.coo_array(matrix).coords[1 - axis], minlength=matrix.shape[1 - axis]) == 0
+
+
+def _pattern(matrix: sp.csr_array) -> tuple[bytes, bytes]:
+    """Where a matrix has elements, as a key."""
+    return matrix.indptr.tobytes(), matrix.indices.tobytes()
 
 
 def _matrix(places: SparseJacobian, values: Any) -> sp.csr_array:
@@ -174,6 +180,7 @@ def _ones(places: SparseJacobian) -> sp.csr_array:
 def _combined(structure: Structure) -> sp.csr_array:
     """The combinations of the equations that are left first."""
     large, left = structure.large, np.array(structure.left(0), int)
+    assert large is not None
     if large.combinations is not None:
         return large.combinations.matrix
     at = np.arange(len(left)), left

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.core
 import jax.lax as lax
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
@@ -115,7 +116,7 @@ class _Program:
     # ---- Values ----
 
     def constant(self, x: Any) -> int:
-        if isinstance(x, jax.core.Tracer) or jax.dtypes.issubdtype(x.dtype, jax.dtypes.extended):
+        if isinstance(x, jax.core.Tracer) or jnp.issubdtype(x.dtype, jax.dtypes.extended):
             return self.operation(("constant", id(x)), x.shape, x.dtype, lambda: x)
         x = np.asarray(x)
         if x.size and x.tobytes() == x.flat[0].tobytes() * x.size:
@@ -223,14 +224,14 @@ class _Program:
             if found is not None:
                 return [self.constant(np.asarray(found).astype(out[0].dtype))]
         match name:
-            case "copy" | "copy_p":
+            case "copy":
                 return row
             case "convert_element_type" if out[0].dtype == xs[0].dtype:
                 return row
             case "concatenate":
                 return [self.concatenated(row, params["dimension"])]
             case "slice" if set(params["strides"] or (1,)) == {1}:
-                return [self.sliced(*row, params["start_indices"], params["limit_indices"])]
+                return [self.sliced(row[0], params["start_indices"], params["limit_indices"])]
             case "split":
                 return self._split(row[0], params["sizes"], params["axis"])
             case "reshape" | "squeeze" | "expand_dims":

@@ -69,11 +69,7 @@ class Pattern:
     """
 
     def __init__(
-        self,
-        shape: tuple[int, int],
-        found: list[tuple[int, Any]],
-        dense: np.ndarray,
-        klu: bool,
+        self, shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray, klu: bool
     ):
         (self.size, self.num_columns), self.dense_rows = shape, np.flatnonzero(dense)
         self.klu = klu

@@ -226,3 +226,21 @@ def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
     np.testing.assert_allclose(y, solved(10**9), rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(y[0] - 1, np.sin(0.1), rtol=1e-13)
     np.testing.assert_allclose(y[-1] - y[-2] ** 3, 0, atol=1e-15)
+
+
+def test_a_structure_at_special_numbers_is_not_remembered_for_general_ones(monkeypatch):
+    """A coupling of slopes is zero in `args` when `at` asks first."""
+    monkeypatch.setattr(search, "LEAST_KLU", 0)
+
+    def residual(t, y, dy, k):
+        (x, v, z), (dx, dv, _) = y, dy
+        return dx - v, k * dx + dv - z, x - jnp.cos(t)
+
+    def slopes(dae, k):
+        return jax.jit(lambda y: dae.term.vf(0.3, y, k))(y)
+
+    y = (jnp.ones(4), jnp.ones(4), jnp.ones(4))
+    first, alone = dfc.DAE(residual=residual), dfc.DAE(residual=lambda *given: residual(*given))
+    first.at(y, args=jnp.zeros(4))
+    for a, b in zip(slopes(first, jnp.ones(4)), slopes(alone, jnp.ones(4)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
