@@ -25,7 +25,7 @@ FROZEN_STEPS = 6
 BACKTRACKING_FACTOR = 1 / 4
 # Up to this many constraints the elimination is written out, element by element, so that XLA fuses
 # it with what is around it. A call of LAPACK would take most of the time of a small projection.
-WRITTEN_OUT = 4
+MAX_UNROLLED = 4
 # This power of roundoff, times the root of the number of constraints, is added to the diagonal of
 # larger matrices, as a share of it, so that they can be factored where constraints depend on each
 # other. The residuals of such constraints contradict each other by roundoff, which becomes an error
@@ -37,7 +37,7 @@ REGULARISATION_POWER = 3 / 4
 NUM_REFINEMENTS = 2
 # Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
-AT_BOUND = 1e-10
+SLOPE_BEYOND_BOUNDS = 1e-10
 # Up to this many unknowns and constraints together a dense system is solved in each step: that of
 # the nearest point from far away, and a sparse one that is too wide for blocks.
 MAX_DENSE_SYSTEM = 512
@@ -45,17 +45,17 @@ MAX_DENSE_SYSTEM = 512
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
 # nothing is.
-OPERATIONS = 2048
+MAX_SCALAR_OPERATIONS = 2048
 # Where most operations are expected to be none, as in a derivative of a derivative, so many times
 # as many are tried. Each takes about 5 µs.
-TRIED = 8
+SIMPLIFICATION_FACTOR = 8
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).
-LEAST_SPARSE = 33
+MIN_SPARSE = 33
 # From this number of unknowns on the linear systems of a stiff solver are solved by KLU, if their
 # matrix is sparse. From the second on a dense one is announced.
-LEAST_KLU = 100
-LARGE_DENSE = 300
+MIN_KLU = 100
+WARN_DENSE = 300
 # A row is dense if it has more than this many times the elements of the median row: a bond has 6
 # elements, an energy all of them.
 DENSE_ROW_RATIO = 16
@@ -65,5 +65,5 @@ MAX_DENSE_ROWS = 16
 # Dense matrices and blocks of sparse ones with up to this many rows are eliminated row by row, so
 # that compile time grows with their size. Larger dense ones are factored by LAPACK. Sparse ones
 # whose blocks would be larger are factored by KLU, or solved by iteration; where KLU can be had it
-# is faster, and compiles faster, from blocks of more than `WRITTEN_OUT` rows on.
+# is faster, and compiles faster, from blocks of more than `MAX_UNROLLED` rows on.
 MAX_BLOCK = 16

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
-from diffrax_conserve._constants import OPERATIONS
+from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
 from diffrax_conserve._dae.dae import _Constraints
 from diffrax_conserve._fast.arrays import folded
-from diffrax_conserve._fast.scalars import in_scalars, small, written
+from diffrax_conserve._fast.scalars import scalarised, small, written
 
 from .test_scalars import equations_in, names_of_arrays
 
@@ -43,7 +43,7 @@ STEP = st.tuples(st.sampled_from(sorted(STEPS)), st.integers(0, 9), st.integers(
 
 def in_full(fn, *like):
     """`small`, also where the function is smaller in arrays."""
-    program = written(fn, like, lambda *_: OPERATIONS, differentiated=True, zeros=True)
+    program = written(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, differentiated=True, zeros=True)
     assert program is not None
     return program
 
@@ -139,7 +139,7 @@ def test_a_product_with_zero_is_nothing_only_in_a_small_program():
     """Where a function is conserved it keeps its NaN."""
     x, fn = jnp.array(-1.0), lambda x: 1 + 0 * jnp.sqrt(x)
     assert in_full(fn, x)(x) == 1
-    assert jnp.isnan(in_scalars(fn, x)(x))
+    assert jnp.isnan(scalarised(fn, x)(x))
 
 
 def test_only_a_primitive_without_a_rule_stays_in_arrays():
@@ -154,8 +154,12 @@ def test_a_function_that_is_not_small_or_prints_stays_as_it_is():
         jax.debug.print("{}", y)
         return y
 
-    large = jnp.ones(OPERATIONS)
-    for fn, y in ((prints, Y), (jnp.sin, jnp.ones(OPERATIONS + 1)), (lambda y: y * y + 1, large)):
+    large = jnp.ones(MAX_SCALAR_OPERATIONS)
+    for fn, y in (
+        (prints, Y),
+        (jnp.sin, jnp.ones(MAX_SCALAR_OPERATIONS + 1)),
+        (lambda y: y * y + 1, large),
+    ):
         assert small(fn, y) is fn
     for fn in (jnp.sin, lambda y: y + y[::-1]):  # smaller in arrays
         assert small(fn, Y) is fn

@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._constants import LEAST_KLU
+from .._constants import MIN_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.run_once import run_once
 from .._hashable import Hashable
@@ -33,7 +33,7 @@ from .._projection.base import AbstractProjection, adapted, check_projection
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
-from .._solver.manifold_projection import ManifoldProjection, or_nothing
+from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
@@ -222,7 +222,7 @@ class DAE(Hashable):
                     "`DAE` it starts from a state that satisfies the equations. Pass "
                     "`SimplifiedNewton()` or `Newton()`."
                 )
-            kept["further"] = or_nothing(manifold)
+            kept["further"] = or_trivial(manifold)
             back = Staged(("equations", back), ("further", further))
         return ManifoldProjection(solver, kept, projection=back)
 
@@ -398,7 +398,7 @@ class DAE(Hashable):
             if self.algebraic is not None:
                 g = ravel(values["algebraic"]).astype(vector.dtype)
                 return jnp.concatenate([slopes[: f.size] - f, g])
-            if matrix is not None and size >= LEAST_KLU:
+            if matrix is not None and size >= MIN_KLU:
                 return matrix @ slopes - f
             mass = self.mass(t, state, args) if matrix is None else matrix.matrix.toarray()
             return jnp.asarray(mass, vector.dtype) @ slopes - f
@@ -698,13 +698,13 @@ def _solved_for(
 
     residual = reduction.small(residual, y[free])
     large = structure.large
-    if large is None or large.by_free is None or free.size < LEAST_KLU:
+    if large is None or large.by_free is None or free.size < MIN_KLU:
         found = root(residual, ft.partial(newton, residual), y[free], divided)
     else:
         sparse = SparseNewton(large.by_free)
         newton = ft.partial(newton, residual, sparse=sparse)
         found = root(residual, newton, y[free], sparse.solve, sparse.jacobian)
-    return moved(found.y), found.ok & jnp.asarray(False if found.more is None else found.more)
+    return moved(found.y), found.ok & jnp.asarray(False if found.aux is None else found.aux)
 
 
 @final

@@ -30,7 +30,7 @@ from .._fast.arrays import folded
 from .._fast.run_once import run_once
 from .._fast.scalars import small
 from .._numerics.implicit import root
-from .._tree import without_pattern
+from .._tree import eps_of, irregular_weights
 from .large import Large
 from .newton import SparseNewton, algebraic_newton, divided
 
@@ -125,7 +125,7 @@ class Structure:
         what they can correct moves no other unknown."""
         free = np.isin(np.arange(self.size), self.algebraic)
         some = jnp.where(sizes > 0, sizes, 1)
-        return jnp.where(free, some / float(jnp.finfo(sizes.dtype).eps), sizes)
+        return jnp.where(free, some / eps_of(sizes), sizes)
 
     def stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are
@@ -285,7 +285,7 @@ class Reduction:
         if structure.apart:
             return ~jnp.any(left)
         along, _ = self.freely_moved(t, y)
-        least = float(jnp.finfo(y.dtype).eps) ** REGULARISATION_POWER
+        least = eps_of(y) ** REGULARISATION_POWER
         return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
 
     def all_slopes(self, t: Array, y: Array) -> Array:
@@ -406,7 +406,7 @@ def _near(
 
 def general_states(t: Array, y: Array, share: float) -> tuple[Array, Array, Array]:
     """A time and a state at this relative distance, and two slopes."""
-    pattern = without_pattern(3 * y.size + 1, y.dtype)
+    pattern = irregular_weights(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
     size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
     moved = y + share * size * (1 + pattern[: y.size] / 2)
@@ -427,7 +427,7 @@ def _extended(matrix: np.ndarray, round: Round) -> Round:
         inner = matrix[np.ix_(rows, columns)]
         matrix = matrix - matrix[:, columns] @ np.linalg.solve(inner, matrix[rows])
     matrix[rows], matrix[:, columns] = 0, 0
-    least = float(jnp.finfo(jnp.result_type(float)).eps) ** REGULARISATION_POWER
+    least = eps_of(jnp.result_type(float)) ** REGULARISATION_POWER
     while np.max(np.abs(matrix), initial=0) > least:
         i, j = np.unravel_index(np.argmax(np.abs(matrix)), matrix.shape)
         matrix = matrix - np.outer(matrix[:, j], matrix[i]) / matrix[i, j]

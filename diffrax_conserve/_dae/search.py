@@ -19,10 +19,10 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array
 
-from .._constants import LEAST_KLU
+from .._constants import MIN_KLU
 from .._hashable import is_array
 from .._large.klu import available, why_not
-from .._tree import without_pattern
+from .._tree import irregular_weights
 from .large_search import NotFound, find_large_structure
 from .reduction import Implicit, Numbers, Singular, Structure, find_structure
 
@@ -119,7 +119,7 @@ class Search:
 
 
 def _large_structure(equations: Any, numbers: Any, others: Any, t: Any, y: Any, *more: Any) -> Any:
-    if y.size < LEAST_KLU:
+    if y.size < MIN_KLU:
         raise NotFound("they are few")
     if not available(y.dtype):
         raise NotFound(why_not() or "that needs float64 on a CPU")
@@ -149,7 +149,7 @@ def general_numbers(kinds: Any, size: float) -> Any:
     one."""
     leaves, treedef = jtu.tree_flatten(kinds)
     ends = np.cumsum([np.prod(x.shape, dtype=int) for x in leaves])
-    pattern = size * (1 + np.asarray(without_pattern(max(int(ends[-1]), 1), float)) / 2)
+    pattern = size * (1 + np.asarray(irregular_weights(max(int(ends[-1]), 1), float)) / 2)
 
     def of(kind: Any, end: int) -> Array:
         if not jnp.issubdtype(kind.dtype, jnp.inexact):

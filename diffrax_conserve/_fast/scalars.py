@@ -35,17 +35,17 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._constants import OPERATIONS, TRIED
+from .._constants import MAX_SCALAR_OPERATIONS, SIMPLIFICATION_FACTOR
 from .jaxprs import closed_jaxpr, num_equations, outputs, walk
 
 
-def written_out(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
+def scalarised_result(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Array]:
     """`fn(y)`, computed in scalars if that is possible and `fn` is small.
 
     XLA tends to repeat the whole computation for each element of the result, so the limit is
     divided by their number.
     """
-    limit = lambda size, _: OPERATIONS // max(1, size)  # noqa: E731
+    limit = lambda size, _: MAX_SCALAR_OPERATIONS // max(1, size)  # noqa: E731
     return (written(fn, (y,), limit, differentiated=True) or fn)(y)
 
 
@@ -58,17 +58,17 @@ def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[
     A product with the number zero is zero here, also where the other factor is infinite, as in all
     derivatives by JAX.
     """
-    limit = lambda _, in_arrays: min(OPERATIONS, in_arrays)  # noqa: E731
+    limit = lambda _, in_arrays: min(MAX_SCALAR_OPERATIONS, in_arrays)  # noqa: E731
     return written(fn, like, limit, differentiated=True, zeros=True) or fn
 
 
-def in_scalars(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
+def scalarised(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements.
 
     It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
     a derivative rule of its own is looked into, and its rule is lost.
     """
-    return written(fn, like, lambda *_: OPERATIONS, arrays=False)
+    return written(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, arrays=False)
 
 
 def written(
@@ -85,7 +85,7 @@ def written(
     tuples of their elements."""
     leaves, treedef = jtu.tree_flatten(like)
     shapes = [jnp.shape(x) for x in leaves]
-    if sum(map(prod, shapes)) > OPERATIONS:
+    if sum(map(prod, shapes)) > MAX_SCALAR_OPERATIONS:
         return None
     closed, out = jax.make_jaxpr(fn, return_shape=True)(*like)
     outs, out_treedef = jtu.tree_flatten(out)
@@ -117,7 +117,7 @@ def written(
     return evaluated
 
 
-def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
+def alone_or_batched(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     """`run(given, lanes)` as a function of `given`, where `lanes` tells whether it is batched.
 
     Both forms are jitted, so that JAX traces each once, although it batches the loop over the steps
@@ -141,13 +141,13 @@ def alone_or_in_lanes(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     return call
 
 
-def written_out_loop(
-    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, counter: Array
+def scalarised_loop(
+    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, tests_left: Array
 ) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
-    """The functions of a loop, `first = start(y)` and `y, counter = advance(first, y, counter)`, in
+    """The functions of a loop, `first = start(y)` and `y, tests_left = advance(first, y, tests_left)`, in
     scalars, with `y` as a tuple of them. They are given back as they are if one is too large."""
     first = jax.eval_shape(start, y)
-    starts, advances = in_scalars(start, y), in_scalars(advance, first, y, counter)
+    starts, advances = scalarised(start, y), scalarised(advance, first, y, tests_left)
     if starts is None or advances is None:
         return start, advance, y
     return starts, advances, components(y)
@@ -603,7 +603,9 @@ class _Program:
 
     def _count(self, operations: int) -> None:
         self.num_operations += operations
-        if self.num_operations > (TRIED * OPERATIONS if self.zeros else self.limit):
+        if self.num_operations > (
+            SIMPLIFICATION_FACTOR * MAX_SCALAR_OPERATIONS if self.zeros else self.limit
+        ):
             raise _NotWrittenOut
 
 

@@ -30,11 +30,11 @@ from jaxtyping import Array, Float
 
 from .._constants import (
     DENSE_ROW_RATIO,
-    LEAST_SPARSE,
     MAX_BLOCK,
     MAX_DENSE_ROWS,
     MAX_DENSE_SYSTEM,
-    WRITTEN_OUT,
+    MAX_UNROLLED,
+    MIN_SPARSE,
 )
 from .asdex_import import asdex, reason
 from .detection import constants_of, content_key, jacobian_places
@@ -122,7 +122,7 @@ class Pattern:
         best = int(np.argmin(widths))
         # Wider blocks, written out, compile for long, and KLU is faster with them.
         by_klu = self.size + self.num_columns > MAX_DENSE_SYSTEM and self.klu
-        if widths[best] > (WRITTEN_OUT if by_klu else MAX_BLOCK):
+        if widths[best] > (MAX_UNROLLED if by_klu else MAX_BLOCK):
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
@@ -223,7 +223,7 @@ def pattern_of(
     """The pattern of the Jacobian of these functions; `None` if they are few, or if it is not
     sparse or cannot be found."""
     m, n = sum(sizes), y.size
-    if m < LEAST_SPARSE:
+    if m < MIN_SPARSE:
         return None
     try:
         asdex()

@@ -30,7 +30,7 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
 from .._manifold import evaluate, is_entry, named_entries
-from .._tree import key_of, ravel, tree_stop_gradient, unflatten, unravel
+from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows
@@ -144,7 +144,7 @@ class Problem(eqx.Module):
         return self.magnitude + jacobian.absolute_matvec(size)
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
-        eps = float(jnp.finfo(scale.dtype).eps)
+        eps = eps_of(scale)
         rtol = ROUNDOFF * eps if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
@@ -167,7 +167,7 @@ class Problem(eqx.Module):
         beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(ABOVE_TOLERANCE), jnp.int8(NOT_FINITE))
         return jnp.min(jnp.where(on, within, beyond)), jnp.where(noise, 0, g)
 
-    def holds(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
+    def is_on_manifold(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
         return self.level(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
@@ -200,11 +200,11 @@ class Problem(eqx.Module):
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
         after, jacobian = problem.linearise(y)
         scale = problem.scale(jacobian, y)
-        sizes = [jnp.abs(relative(g, scale)) for g in (problem.residual(candidate), after)]
+        sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        holds = problem.level(after, scale)[0] >= WITHIN_TOLERANCE
-        success = (settled | holds) if ok is None else ok
+        is_on_manifold = problem.level(after, scale)[0] >= WITHIN_TOLERANCE
+        success = (settled | is_on_manifold) if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
@@ -217,8 +217,8 @@ class Problem(eqx.Module):
             num_iterations=jnp.asarray(num_iterations),
             residual_before=before,
             residual_after=after,
-            correction=problem.factor.length(y - candidate),
-            roundoff=jnp.max(relative(problem.cancellation, scale)),
+            correction=problem.factor.norm(y - candidate),
+            roundoff=jnp.max(relative_to_scale(problem.cancellation, scale)),
             # An iteration that diverged makes every residual large. So we look for the entry whose
             # residual is large both before and after: of both the smaller one counts.
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
@@ -231,7 +231,7 @@ def component_changes(start: Float[Array, " n"], end: Float[Array, " n"]) -> Flo
     return jnp.abs(end - start)
 
 
-def step_length(
+def step_norm(
     start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
 ) -> Float[Array, ""]:
     """The length of a step in the metric, with which the length of a correction is compared.
@@ -240,17 +240,17 @@ def step_length(
     the roundoff of the residuals alone moves a state by about that much. Without this floor a step
     at rest would have no length, and every correction would be longer than it.
     """
-    least = float(jnp.finfo(end.dtype).eps) ** 0.5 * jnp.abs(end)
-    return factor.length(jnp.maximum(jnp.abs(end - start), least))
+    floor = eps_of(end) ** 0.5 * jnp.abs(end)
+    return factor.norm(jnp.maximum(jnp.abs(end - start), floor))
 
 
-def relative(residual: Any, scale: Any) -> Any:
+def relative_to_scale(residual: Any, scale: Any) -> Any:
     """Residuals divided by their scales. A scale of zero counts as one, so that a residual that is
     exactly zero stays zero instead of becoming NaN."""
     return jtu.tree_map(lambda g, s: g / jnp.where(s > 0, s, jnp.ones_like(s)), residual, scale)
 
 
-def measure(
+def residuals_and_scales(
     manifold: Manifold, values: Values, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Values, Values]:
     """The residuals at `y` and their scales there, both shaped like the values of the manifold."""
@@ -312,7 +312,7 @@ def problem_of(
     )
 
 
-class _Known:
+class _Concrete:
     """An array in a box, which JAX takes for a leaf that is no array. So no transformation replaces
     it by a tracer, and its numbers remain known."""
 
@@ -330,9 +330,9 @@ class _Converted(eqx.Module):
     def __init__(self, fn: Any):
         def known(x: Any) -> Any:
             constant = hasattr(x, "dtype") and not isinstance(x, jax.core.Tracer)
-            return _Known(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
+            return _Concrete(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
 
         self.fn = jtu.tree_map(known, fn)
 
     def __call__(self, y: Array) -> Array:
-        return jtu.tree_map(lambda x: x.value if isinstance(x, _Known) else x, self.fn)(y)
+        return jtu.tree_map(lambda x: x.value if isinstance(x, _Concrete) else x, self.fn)(y)

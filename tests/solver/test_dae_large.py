@@ -109,8 +109,8 @@ SMALL = [
 
 
 def made(make, n, least, monkeypatch):
-    monkeypatch.setattr(search, "LEAST_KLU", least)
-    monkeypatch.setattr(dae_module, "LEAST_KLU", least)
+    monkeypatch.setattr(search, "MIN_KLU", least)
+    monkeypatch.setattr(dae_module, "MIN_KLU", least)
     dae, guess = make(n)
     y = dae._state(guess)
     structure = dae_module._structure(dae, 0.0, y, None)
@@ -212,8 +212,8 @@ def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
     """Heat and a ladder of diodes, to the tolerance of the solve."""
 
     def solved(least):
-        monkeypatch.setattr(search, "LEAST_KLU", least)
-        monkeypatch.setattr(dae_module, "LEAST_KLU", least)
+        monkeypatch.setattr(search, "MIN_KLU", least)
+        monkeypatch.setattr(dae_module, "MIN_KLU", least)
         dae, guess = heat(120)
         y0 = dae.consistent(*guess)
         steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
@@ -230,7 +230,7 @@ def test_a_large_solve_is_that_of_dense_matrices(monkeypatch):
 
 def test_a_structure_at_special_numbers_is_not_remembered_for_general_ones(monkeypatch):
     """A coupling of slopes is zero in `args` when `at` asks first."""
-    monkeypatch.setattr(search, "LEAST_KLU", 0)
+    monkeypatch.setattr(search, "MIN_KLU", 0)
 
     def residual(t, y, dy, k):
         (x, v, z), (dx, dv, _) = y, dy
