@@ -64,5 +64,6 @@ DENSE_ROW_RATIO = 16
 MAX_DENSE_ROWS = 16
 # Dense matrices and blocks of sparse ones with up to this many rows are eliminated row by row, so
 # that compile time grows with their size. Larger dense ones are factored by LAPACK. Sparse ones
-# whose blocks would be larger are factored by KLU, or solved by iteration.
+# whose blocks would be larger are factored by KLU, or solved by iteration; where KLU can be had it
+# is faster, and compiles faster, from blocks of more than `MAX_UNROLLED` rows on.
 MAX_BLOCK = 16

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
 from diffrax_conserve._dae.dae import _Constraints
+from diffrax_conserve._fast.arrays import folded
 from diffrax_conserve._fast.scalars import scalarised, small, written
 
 from .test_scalars import equations_in, names_of_arrays
@@ -66,8 +67,8 @@ def assert_near(got, expected):
 
 
 @settings(max_examples=16)
-@given(st.lists(STEP, min_size=1, max_size=5))
-def test_a_small_program_is_the_function_with_its_derivatives(steps):
+@given(st.lists(STEP, min_size=1, max_size=5), st.sampled_from([in_full, folded]))
+def test_a_small_program_is_the_function_with_its_derivatives(steps, in_full):
     """In both modes, of second order, in a batch, and once more written out."""
     fn = function(steps)
 
@@ -109,9 +110,10 @@ def test_indices_move_the_elements_that_jax_moves(rows, columns, mode, kind):
         lanes = jax.vmap(lambda x, i: (x.at[i].get(mode=mode), x.at[i].add(x[0], mode=into)))
         return lanes(x, i), jax.vmap(lambda i: x[0].at[i].get(mode=mode), 0, 1)(i)
 
-    program = in_full(fn, x)
-    for got, expected in zip(jax.tree.leaves(program(x)), jax.tree.leaves(fn(x)), strict=True):
-        np.testing.assert_array_equal(got, expected)
+    program, results = in_full(fn, x), jax.tree.leaves(fn(x))
+    for one in (program, folded(fn, x)):
+        for got, expected in zip(jax.tree.leaves(one(x)), results, strict=True):
+            np.testing.assert_array_equal(got, expected)
     left = [eqn.primitive.name for eqn in equations_in(jax.make_jaxpr(program)(x).jaxpr)]
     assert not {"gather", "scatter", "scatter-add", "dynamic_slice"} & set(left)
 

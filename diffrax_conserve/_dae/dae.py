@@ -19,8 +19,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._constants import MIN_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
+from .._fast.run_once import run_once
 from .._hashable import Hashable
-from .._large.klu import sparse_jacobian
 from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
@@ -34,7 +34,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
-from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
+from .._tree import ravel, tree_all_finite, tree_shapes, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
 from .newton import (
@@ -260,17 +260,20 @@ class DAE(Hashable):
         """
         y = self._state(guess)
         _checked_structure(self, t, y, args)
+        is_traced = _is_traced(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         moves = None if fixed is None else ~_flags(fixed, y)
-        found, ok = _consistent(self, t, y, args, moves)
+        found, ok = (_consistent.inside if is_traced else _consistent)(self, t, y, args, moves)
         message = (
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
             "the equations that are differentiated."
         )
-        if eqx.is_array(ok) and not isinstance(ok, jax.core.Tracer) and not ok:
+        if isinstance(ok, jax.core.Tracer):
+            return eqx.error_if(found, ~ok, message)
+        if not ok:
             raise ValueError(message)
-        return eqx.error_if(found, ~ok, message)
+        return found
 
     def report(self, *guess: Any, t: RealScalarLike = 0.0, args: Args = None) -> "DAEReport":
         """What was found out about the equations, at the state of a guess.
@@ -295,7 +298,7 @@ class DAE(Hashable):
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
         times = structure.times
-        off = eqx.filter_jit(_Constraints(self))(t, y, args)[: structure.index]
+        off = run_once(eqx.filter_jit)(_Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
@@ -325,12 +328,12 @@ class DAE(Hashable):
         As `consistent`, and `TypeError` where JAX traces.
         """
         y = self._state(guess)
-        search = _search(self, y, args)
-        if search.is_traced or any_traced((self, t, y, args)):
+        if _is_traced(self, t, y, args):
             raise TypeError(
                 "`at` of a `DAE` finds its structure from numbers, but JAX traces them here: call "
                 "it outside of `jax.jit` and the like."
             )
+        search = _search(self, y, args)
         found = _found(self, t, y, args, lambda: search.at((self, args), *_numbers(t, y)))
         return dataclasses.replace(self, structure=found)
 
@@ -483,11 +486,9 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
 def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
     """The structure; raises if the equations have another one with the numbers that are given."""
     structure = _structure(dae, t, y, args)
-    if dae.structure is not None or any_traced((dae, t, y, args)):
+    if dae.structure is not None or _is_traced(dae, t, y, args):
         return structure
     search = _search(dae, y, args)
-    if search.is_traced:
-        return structure
 
     def near() -> Structure:
         try:
@@ -504,6 +505,14 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
             "`wrap` of that."
         )
     return structure
+
+
+def _is_traced(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> bool:
+    """Whether JAX traces one of these, what the functions close over, or a function around this
+    call, in which each operation gives a tracer."""
+    if any_traced((dae, t, y, args, jnp.zeros(()) + 0)):
+        return True
+    return dae.structure is None and _search(dae, y, args).is_traced
 
 
 def _search(dae: DAE, y: Y, args: Args) -> Search:
@@ -631,11 +640,10 @@ class ConstraintProjection(AbstractProjection):
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.
-        ok = settled | tree_stop_gradient(problem).is_on_manifold(lax.stop_gradient(y))
-        return y, problem.report(candidate, y, ok=ok)
+        return y, problem.report(candidate, y, settled=settled)
 
 
-@eqx.filter_jit
+@run_once(eqx.filter_jit)
 def _consistent(
     dae: DAE, t: Array, y: Y, args: Args, moves: Bool[np.ndarray, " n"] | None
 ) -> tuple[Y, Bool[Array, ""]]:
@@ -689,12 +697,11 @@ def _solved_for(
         return jnp.where(fits, reduction.constraints(t, moved(z))[0], jnp.nan)
 
     residual = reduction.small(residual, y[free])
-    is_large = structure.large is not None and free.size >= MIN_KLU
-    jacobian = sparse_jacobian(residual, y[free]) if is_large else None
-    if jacobian is None:
+    large = structure.large
+    if large is None or large.by_free is None or free.size < MIN_KLU:
         found = root(residual, ft.partial(newton, residual), y[free], divided)
     else:
-        sparse = SparseNewton(jacobian)
+        sparse = SparseNewton(large.by_free)
         newton = ft.partial(newton, residual, sparse=sparse)
         found = root(residual, newton, y[free], sparse.solve, sparse.jacobian)
     return moved(found.y), found.ok & jnp.asarray(False if found.aux is None else found.aux)

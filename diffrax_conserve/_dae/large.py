@@ -82,6 +82,7 @@ class Large:
         no slopes; `None` if they contain no slopes.
     - `along`: the directions in which a state moves without what the equations differentiate, with
         a column for each unknown for whose slope they are not solved; `None` if it is not known.
+    - `by_free`: with index 1 the places of the derivative of what is left by a movement along them.
     - `eliminations`: for each differentiation but the first.
     - `for_slopes`: the places of the derivative by slopes of the equations after the last
         differentiation, which determine all slopes.
@@ -91,5 +92,6 @@ class Large:
     by_slope: SparseJacobian
     combinations: SparseMatrix | None = None
     along: SparseMatrix | None = None
+    by_free: SparseJacobian | None = None
     eliminations: tuple[Elimination, ...] = ()
     for_slopes: SparseJacobian | None = None

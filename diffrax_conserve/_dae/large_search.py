@@ -13,7 +13,7 @@ can not do is refused with its reason, before it takes long.
 import contextlib
 import dataclasses
 import functools as ft
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array
 
+from .._fast.run_once import run_once
 from .._large.asdex_import import asdex
 from .._large.elimination import TooFull, combinations, extended
 from .._large.klu import SparseJacobian
@@ -64,14 +65,28 @@ def find_large_structure(
     y: Array,
     mass: sp.csr_array | None,
     unknown: tuple[int, ...],
+    memory: dict[Any, Any],
     known: Structure | None = None,
 ) -> Structure:
     """As `find_structure`. `unknown` are the numbers that may have any values, also where they are
-    indices."""
+    indices. `memory` holds what does not depend on the numbers, for the next search."""
+
+    def once(key: Any, find: Callable[[], Any]) -> Any:
+        if key not in memory:
+            memory[key] = find()
+        return memory[key]
+
+    def found() -> Large:
+        given = places.of(equations, 2, n) if mass is None else _jacobian(mass)
+        return Large(places.of(equations, 1, n), given)
+
     n = y.size
     places = _Places(numbers, unknown)
-    by_slope, by_y = places.of(equations, 2, n), places.of(equations, 1, n)
-    t, y, values, is_linear, absent = _general_position(equations, by_y, by_slope, numbers, t, y)
+    large = once("places", found)
+    by_y, by_slope = large.by_y, large.by_slope
+    t, y, of_y, values, is_linear, absent = _general_position(
+        equations, by_y, by_slope, numbers, t, y
+    )
     matrix = other = _matrix(by_slope, values)
     if mass is None:
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
@@ -84,7 +99,7 @@ def find_large_structure(
     apart = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
     structure = Structure(
-        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=Large(by_y, by_slope)
+        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=large
     )
     seen, brought, met, needed = np.zeros(n, bool), [], [], none
     in_places = by_slope.rows, by_slope.columns
@@ -95,11 +110,20 @@ def find_large_structure(
             selected = tuple(np.array(x, int) for x in before[0])
         if structure.index == MAX_INDEX:
             raise NotFound(f"their index is larger than {MAX_INDEX}")
-        structure = _with_round(structure, selected, matrix, needed)
+        one = Round(*map(_tuple, selected))
+        kind = structure.is_linear, structure.mass is None, structure.apart, _pattern(matrix)
+        further = ft.partial(_with_round, structure, selected, matrix, needed)
+        large = once((structure, one, *kind), further)
+        structure = dataclasses.replace(structure, rounds=(*structure.rounds, one), large=large)
         left = np.array(structure.left(structure.index - 1), int)
-        last = _Last(equations, structure)
-        of_last = places.of(last.constraints, 1, n)
-        new = _matrix(of_last, last.values(of_last, numbers, t, y))
+        if structure.index == 1:  # the derivatives of equations, or of combinations of them
+            share = _combined(structure)
+            at, new = _jacobian(abs(share) @ _ones(by_y)), sp.csr_array(share @ _matrix(by_y, of_y))
+            new.eliminate_zeros()
+        else:
+            last = _Last(equations, structure)
+            at = once(last, ft.partial(places.of, last.constraints, 1, n))
+            new = _matrix(at, last.values(at, numbers, t, y))
         contained = ~_empty(new, 0)
         brought.append(np.flatnonzero(contained & ~seen))
         met.append(len(extended(new[:, brought[-1]], (none, none))[0]) == len(left))
@@ -111,16 +135,13 @@ def find_large_structure(
             blamed = left[~np.isin(start + np.arange(len(left)), independent)]
             raise Singular(_tuple(blamed), absent)
         matrix = _replaced(matrix, left, new)
-        needed = np.unique(of_last.columns)
+        needed = np.unique(at.columns)
         kept = ~np.isin(in_places[0], left)
-        added = left[of_last.rows], of_last.columns
+        added = left[at.rows], at.columns
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
-    for_slopes = SparseJacobian(*in_places, (n, n))
-    large = dataclasses.replace(structure.large, for_slopes=for_slopes)  # pyright: ignore
+    large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
     structure = dataclasses.replace(structure, large=large)
-    if structure.index == 1 and large.along is None:
-        raise NotFound("the coefficients of their slopes are coupled, and not constant")
     if all(met):
         structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
     return structure
@@ -135,10 +156,35 @@ def _empty(matrix: sp.csr_array, axis: int) -> np.ndarray:
     return np.bincount(sp.coo_array(matrix).coords[1 - axis], minlength=matrix.shape[1 - axis]) == 0
 
 
+def _pattern(matrix: sp.csr_array) -> tuple[bytes, bytes]:
+    """Where a matrix has elements, as a key."""
+    return matrix.indptr.tobytes(), matrix.indices.tobytes()
+
+
 def _matrix(places: SparseJacobian, values: Any) -> sp.csr_array:
     out = sp.csr_array((np.asarray(values), (places.rows, places.columns)), places.shape)
     out.eliminate_zeros()
     return out
+
+
+def _jacobian(pattern: sp.csr_array) -> SparseJacobian:
+    """The places of the elements of a matrix."""
+    rows, columns = sp.coo_array(pattern).coords
+    return SparseJacobian(rows, columns, pattern.shape)
+
+
+def _ones(places: SparseJacobian) -> sp.csr_array:
+    return sp.csr_array((np.ones(len(places.rows)), (places.rows, places.columns)), places.shape)
+
+
+def _combined(structure: Structure) -> sp.csr_array:
+    """The combinations of the equations that are left first."""
+    large, left = structure.large, np.array(structure.left(0), int)
+    assert large is not None
+    if large.combinations is not None:
+        return large.combinations.matrix
+    at = np.arange(len(left)), left
+    return sp.csr_array((np.ones(len(left)), at), (len(left), structure.size))
 
 
 def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.csr_array:
@@ -157,9 +203,9 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 
 def _with_round(
     structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
-) -> Structure:
-    """The structure with one more round, of which the slopes that the constraints before it contain
-    are needed."""
+) -> Large:
+    """What one more round needs, of which the slopes that the constraints before it contain are
+    needed."""
     rows, columns = selected
     large, k = structure.large, structure.index
     assert large is not None
@@ -173,9 +219,8 @@ def _with_round(
     constant = structure.is_linear and structure.mass is not None
     if k == 0:
         large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
-        structure = dataclasses.replace(structure, large=large)
         if structure.apart:
-            return structure
+            return large
         if not constant:
             raise NotFound(
                 "equations without slopes are combinations of others, and the coefficients of "
@@ -185,8 +230,7 @@ def _with_round(
         share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
         whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
         whole = whole - _spread(share, None, rows, structure.size)
-        large = dataclasses.replace(large, combinations=SparseMatrix(whole))
-        return dataclasses.replace(structure, large=large)
+        return dataclasses.replace(large, combinations=SparseMatrix(whole))
     needed = np.intersect1d(needed, columns)
     if constant and given.size == rows.size:
         at = np.searchsorted(np.sort(columns), needed)
@@ -201,8 +245,21 @@ def _with_round(
         one = Elimination(SparseMatrix(_spread(-inverse, needed, rows, structure.size)))
     else:
         one = Elimination(levels=_levels(matrix, rows, columns, needed))
-    large = dataclasses.replace(large, eliminations=(*large.eliminations, one))
-    return dataclasses.replace(structure, large=large)
+    return dataclasses.replace(large, eliminations=(*large.eliminations, one))
+
+
+def _with_slopes(
+    structure: Structure, by_y: SparseJacobian, in_places: tuple[np.ndarray, np.ndarray]
+) -> Large:
+    """What the equations need after the last round."""
+    n, large = structure.size, structure.large
+    large = dataclasses.replace(large, for_slopes=SparseJacobian(*in_places, (n, n)))
+    if structure.index != 1:
+        return large
+    if large.along is None:
+        raise NotFound("the coefficients of their slopes are coupled, and not constant")
+    moved = abs(_combined(structure)) @ _ones(by_y) @ abs(large.along.matrix)
+    return dataclasses.replace(large, by_free=_jacobian(moved))
 
 
 def _along(
@@ -298,14 +355,14 @@ class _Last:
         return _last_values(self, places, numbers, t, y)
 
 
-@ft.partial(jax.jit, static_argnums=(0, 1))
+@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
 def _last_values(
     last: _Last, places: SparseJacobian, numbers: Numbers, t: Array, y: Array
 ) -> Array:
     return places.values(lambda y: last.constraints(numbers, t, y, y), y)
 
 
-@ft.partial(jax.jit, static_argnums=(0, 1))
+@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
 def _by_slope(
     equations: WithNumbers,
     places: SparseJacobian,
@@ -317,7 +374,7 @@ def _by_slope(
     return places.values(lambda slopes: equations(numbers, t, y, slopes), slopes)
 
 
-@ft.partial(jax.jit, static_argnums=(0, 1, 2))
+@run_once(ft.partial(jax.jit, static_argnums=(0, 1, 2)))
 def _near(
     equations: WithNumbers,
     by_y: SparseJacobian,
@@ -342,11 +399,11 @@ def _general_position(
     numbers: Numbers,
     t: Array,
     y: Array,
-) -> tuple[Array, Array, Array, bool, tuple[int, ...]]:
+) -> tuple[Array, Array, Array, Array, bool, tuple[int, ...]]:
     for share in (1e-1, 1e-3, 1e-5, 0.0):
         found = _near(equations, by_y, by_slope, numbers, t, y, share)
         later, moved, of_y, values, is_linear, finite = found
         if finite:
             absent = _empty(_matrix(by_y, of_y), 0) & _empty(_matrix(by_slope, values), 0)
-            return later, moved, values, bool(is_linear), _tuple(np.flatnonzero(absent))
+            return later, moved, of_y, values, bool(is_linear), _tuple(np.flatnonzero(absent))
     raise FloatingPointError

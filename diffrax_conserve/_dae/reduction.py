@@ -26,6 +26,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from .._constants import REGULARISATION_POWER
+from .._fast.arrays import folded
+from .._fast.run_once import run_once
 from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import eps_of, irregular_weights
@@ -150,7 +152,7 @@ class Reduction:
             self.constraints = self.small(self._further(k), t, y)
 
     def small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
-        return fn if self.structure.large is not None else small(fn, *like)
+        return (small if self.structure.large is None else folded)(fn, *like)
 
     def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
         """The constraints with those of round `k`. The first are the equations that are left at the
@@ -374,12 +376,12 @@ def find_structure(
 # What a search evaluates is compiled once for the equations, and then serves all numbers.
 
 
-@ft.partial(jax.jit, static_argnums=0)
+@run_once(ft.partial(jax.jit, static_argnums=0))
 def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
     return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
 
 
-@ft.partial(jax.jit, static_argnums=(0, 1))
+@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
 def _last_gradients(
     equations: WithNumbers, structure: Structure, numbers: Numbers, t: Array, y: Array
 ) -> Array:
@@ -387,7 +389,7 @@ def _last_gradients(
     return jax.jacfwd(lambda y: constraints(t, y)[-1])(y)
 
 
-@ft.partial(jax.jit, static_argnums=0)
+@run_once(ft.partial(jax.jit, static_argnums=0))
 def _near(
     equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float
 ) -> tuple[Array, ...]:

@@ -63,7 +63,7 @@ class Search:
         jaxpr, count = closed.jaxpr, len(closed.consts)
         consts = [None if _is_traced(x) else x for x in closed.consts]
         self._kinds = [_shape(x) for x in closed.consts], kinds, time, state
-        self._consts, self._mass = consts, mass
+        self._consts, self._mass, self._memory = consts, mass, {}
         unknown = [i for i, x in enumerate(consts) if x is None]
         self._unknown = *unknown, *range(count, count + len(kinds))
         self.is_traced = any(x is None for x in consts)  # what the functions close over
@@ -111,7 +111,7 @@ class Search:
         others = [_another(x) for x in numbers]
         given, mass = (self._given, numbers, others, t, y), self._mass
         try:
-            return _large_structure(*given, mass, self._unknown, known)
+            return _large_structure(*given, mass, self._unknown, self._memory, known)
         except NotFound:
             if y.size > MOST_DENSE:
                 raise

@@ -182,7 +182,7 @@ convert_element_type copy cos cosh div eq erf erf_inv erfc exp exp2 expm1 floor 
 integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg nextafter not or pow real
 rem round rsqrt select_n sign sin sinh sqrt square stop_gradient sub tan tanh xor
 """
-_ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
+ELEMENTWISE = frozenset(_ELEMENTWISE_NAMES.split())
 _REDUCTIONS = {
     "reduce_sum": ("add", lax.add),
     "reduce_prod": ("mul", lax.mul),
@@ -219,7 +219,7 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
     return out[tuple(kept)]
 
 
-def _slices(
+def moved_elements(
     shape: Sequence[int], indices: np.ndarray, numbers: Any, moved: Sequence[int]
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
     """Which elements of an array of this shape a gather or scatter moves, as indices with the shape
@@ -249,7 +249,7 @@ def _slices(
 
 # The primitives that only move elements, as functions that move their places by numpy. JAX itself
 # could do that too, but it would compile each of them for each shape, which takes 15 to 50 ms.
-_MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
+MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
     "pad": _pad,
@@ -266,7 +266,7 @@ _MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
 }
 # The primitives that move elements by indices. The operands from the first number to before the
 # last are the indices. We can move the places if the indices are known.
-_BY_INDICES = {
+BY_INDICES = {
     "dynamic_slice": (1, None),
     "dynamic_update_slice": (2, None),
     "gather": (1, 2),
@@ -275,7 +275,7 @@ _BY_INDICES = {
 }
 # What is computed at once for known numbers. Indices need all of it: JAX replaces -1 by the last
 # place before it uses them.
-_KNOWN: dict[str, Callable[..., Any]] = {
+KNOWN: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
@@ -372,15 +372,15 @@ class _Program:
             if value is not None and key not in ("sharding", "out_sharding")
         }
         dtype = eqn.outvars[0].aval.dtype if eqn.outvars else None
-        if name in _MOVES:
-            moved = _MOVES[name](*inputs, **given)
+        if name in MOVES:
+            moved = MOVES[name](*inputs, **given)
             return moved if isinstance(moved, list) else [moved]
-        if name in _BY_INDICES:
+        if name in BY_INDICES:
             return self._by_indices(eqn, inputs)
         if name == "iota":
             indices = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
             return [self._constant(_broadcast(indices, params["shape"], (params["dimension"],)))]
-        if name in _ELEMENTWISE:
+        if name in ELEMENTWISE:
             if name == "copy" or (
                 name == "convert_element_type" and dtype == eqn.invars[0].aval.dtype
             ):
@@ -437,7 +437,7 @@ class _Program:
 
     def _by_indices(self, eqn: Any, inputs: list[_Places]) -> list[_Places]:
         name, params, operand = eqn.primitive.name, eqn.params, inputs[0]
-        first, last = _BY_INDICES[name]
+        first, last = BY_INDICES[name]
         found, dtype = [self._integers(x) for x in inputs[first:last]], eqn.outvars[0].aval.dtype
         indices = [x for x in found if x is not None]
         if len(indices) < len(found):
@@ -448,7 +448,7 @@ class _Program:
         updates = inputs[1 if dynamic else 2] if not takes else operand
         moved = eqn.outvars[0].aval.shape if takes else updates.shape
         starts = np.stack(indices, -1) if dynamic else indices[0]
-        at, inside = _slices(operand.shape, starts, numbers, moved)
+        at, inside = moved_elements(operand.shape, starts, numbers, moved)
         outside = params.get("mode") == lax.GatherScatterMode.FILL_OR_DROP and not np.all(inside)
         if takes and not outside:
             return [operand[at]]
@@ -555,9 +555,9 @@ class _Program:
         """The place of the result of an operation on scalars."""
         name = "add" if name == "add_any" else name
         known = [x if isinstance(x := self.entries[i], np.generic) else None for i in row]
-        if name in _KNOWN and all(x is not None for x in known):
+        if name in KNOWN and all(x is not None for x in known):
             with np.errstate(all="ignore"):
-                return self._number(np.asarray(_KNOWN[name](*known)).astype(dtype)[()])
+                return self._number(np.asarray(KNOWN[name](*known)).astype(dtype)[()])
         simpler = self._simpler(name, row, known, dtype)
         if simpler is not None:
             return simpler

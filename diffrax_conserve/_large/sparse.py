@@ -33,11 +33,12 @@ from .._constants import (
     MAX_BLOCK,
     MAX_DENSE_ROWS,
     MAX_DENSE_SYSTEM,
+    MAX_UNROLLED,
     MIN_SPARSE,
 )
 from .asdex_import import asdex, reason
 from .detection import constants_of, content_key, jacobian_places
-from .klu import Places
+from .klu import Places, available
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
 _LARGE, _GIB = 2**28, 2**30
@@ -63,11 +64,15 @@ class Pattern:
       place of the element in an array shaped like `owners`.
     - `overlap`: the number of each component of a block among those of the next block; `None` if
       blocks are not coupled.
+    - `klu`: whether KLU can be had for these numbers.
     - `wide`: whether the Gram matrix is too wide for blocks. Then each row is a block.
     """
 
-    def __init__(self, shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray):
+    def __init__(
+        self, shape: tuple[int, int], found: list[tuple[int, Any]], dense: np.ndarray, klu: bool
+    ):
         (self.size, self.num_columns), self.dense_rows = shape, np.flatnonzero(dense)
+        self.klu = klu
         self.colours, of_dense, (rows, columns, colour) = _coloured(shape, found, dense)
         self.sparse_colours, self.dense_colours = (
             np.flatnonzero(~of_dense),
@@ -115,7 +120,9 @@ class Pattern:
         a, b = graph.nonzero()
         widths = [int(np.max(np.abs(np.argsort(x)[a] - np.argsort(x)[b]))) for x in orders]
         best = int(np.argmin(widths))
-        if widths[best] > MAX_BLOCK:
+        # Wider blocks, written out, compile for long, and KLU is faster with them.
+        by_klu = self.size + self.num_columns > MAX_DENSE_SYSTEM and self.klu
+        if widths[best] > (MAX_UNROLLED if by_klu else MAX_BLOCK):
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 
@@ -234,7 +241,7 @@ def pattern_of(
         with jax.ensure_compile_time_eval():
             try:
                 found = [jacobian_places(x, y) for x in traced]
-                _KNOWN[keys] = _sparse((m, n), list(zip(sizes, found, strict=True)))
+                _KNOWN[keys] = _sparse((m, n), list(zip(sizes, found, strict=True)), y.dtype)
             except NotImplementedError:  # an operation that asdex does not know
                 _KNOWN[keys] = None
     pattern = _KNOWN[keys]
@@ -257,14 +264,14 @@ def pattern_of(
 _KNOWN: dict[Any, Pattern | None] = {}
 
 
-def _sparse(shape: tuple[int, int], found: list[Any]) -> Pattern | None:
+def _sparse(shape: tuple[int, int], found: list[Any], dtype: Any) -> Pattern | None:
     """The pattern, if few rows are dense and at most a quarter of the elements of the others can
     differ from zero."""
     counts = np.concatenate([np.bincount(r, minlength=size) for size, (r, _) in found])
     dense = counts > DENSE_ROW_RATIO * max(1, np.median(counts))
     if np.sum(dense) > MAX_DENSE_ROWS or not 0 < 4 * np.sum(counts[~dense]) <= np.prod(shape):
         return None
-    return Pattern(shape, found, dense)
+    return Pattern(shape, found, dense, available(dtype))
 
 
 def take(x: Array, places: np.ndarray) -> Array:

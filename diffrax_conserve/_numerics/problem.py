@@ -188,6 +188,7 @@ class Problem(eqx.Module):
         num_iterations: IntScalarLike = 1,
         *,
         ok: Bool[Array, ""] | None = None,
+        settled: Bool[Array, ""] | bool = False,
     ) -> ProjectionInfo:
         """The report on a projection from `candidate` to `y`, as `solve` must return it.
 
@@ -195,7 +196,8 @@ class Problem(eqx.Module):
 
         - `num_iterations`: the number of iterations.
         - `ok`: whether the projection succeeded, if that is known. By default: whether every
-            residual is within its tolerance at `y`.
+            residual is within its tolerance at `y`,
+        - `settled`: or whether this tells that it succeeded.
         """
         # A report has no derivative.
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
@@ -204,7 +206,8 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        success = problem.level(after, scale)[0] >= WITHIN_TOLERANCE if ok is None else ok
+        is_on_manifold = problem.level(after, scale)[0] >= WITHIN_TOLERANCE
+        success = (settled | is_on_manifold) if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence

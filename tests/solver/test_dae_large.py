@@ -161,6 +161,33 @@ def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monke
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize(("make", "n"), [(pairs, 60), (chain, 24)])
+def test_consistent_states_of_a_higher_index_are_those_of_dense_matrices(make, n, monkeypatch):
+    """With 120 unknowns, index 2 and 3; and inside of another program."""
+
+    def values(least):
+        dae, _, y, structure = made(make, n, least, monkeypatch)
+        moved = jax.tree.map(lambda x: x + 0.1 * jnp.sin(jnp.arange(x.size)).reshape(x.shape), y)
+        state = dae.consistent(moved)
+        inside = None if least else jax.jit(lambda: dae.consistent(moved))()
+        constraints = dae_module._Constraints(dae)
+        return (
+            structure.ranks,
+            (state, constraints(0.0, moved, None)),
+            inside,
+            constraints(0.0, state, None),
+        )
+
+    (ranks, dense, *_), (same, large, inside, zeros) = values(10**9), values(0)
+    assert ranks == same
+    for a, b in zip(jax.tree.leaves(dense), jax.tree.leaves(large), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    for a, b in zip(jax.tree.leaves(large[0]), jax.tree.leaves(inside), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+    for h in zeros:
+        np.testing.assert_allclose(h, 0, atol=1e-11)
+
+
 @pytest.mark.parametrize(
     ("make", "n", "index", "freedom"),
     [
@@ -216,3 +243,21 @@ def test_a_large_solve_is_that_of_scipy(monkeypatch):
     np.testing.assert_allclose(y[1:-1], exact, rtol=1e-6)
     np.testing.assert_allclose(y[0] - 1, np.sin(t1), rtol=1e-13)
     np.testing.assert_allclose(y[-1] - y[-2] ** 3, 0, atol=1e-15)
+
+
+def test_a_structure_at_special_numbers_is_not_remembered_for_general_ones(monkeypatch):
+    """A coupling of slopes is zero in `args` when `at` asks first."""
+    monkeypatch.setattr(search, "MIN_KLU", 0)
+
+    def residual(t, y, dy, k):
+        (x, v, z), (dx, dv, _) = y, dy
+        return dx - v, k * dx + dv - z, x - jnp.cos(t)
+
+    def slopes(dae, k):
+        return jax.jit(lambda y: dae.term.vf(0.3, y, k))(y)
+
+    y = (jnp.ones(4), jnp.ones(4), jnp.ones(4))
+    first, alone = dfc.DAE(residual=residual), dfc.DAE(residual=lambda *given: residual(*given))
+    first.at(y, args=jnp.zeros(4))
+    for a, b in zip(slopes(first, jnp.ones(4)), slopes(alone, jnp.ones(4)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
