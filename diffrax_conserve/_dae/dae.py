@@ -636,11 +636,11 @@ class ConstraintProjection(AbstractProjection):
         if structure.large is not None:
             # Along a ladder of a thousand resistors the voltages underflow.
             problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
-        y, settled = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
+        y, converged = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.
-        return y, problem.report(candidate, y, settled=settled)
+        return y, problem.report(candidate, y, converged=converged)
 
 
 @run_once(eqx.filter_jit)

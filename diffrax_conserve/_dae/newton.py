@@ -125,7 +125,7 @@ def algebraic_newton(
     residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
 ) -> Solved:
     """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
-    z, at_rest, num_iterations, settled = at_rest_near(residual, z, sparse)
+    z, at_rest, num_iterations, converged = at_rest_near(residual, z, sparse)
 
     def at_roundoff() -> Bool[Array, ""]:
         if sparse is not None:
@@ -135,9 +135,9 @@ def algebraic_newton(
         scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
         return jnp.all(jnp.abs(g) <= limit * scale)
 
-    unsure = at_rest & ~settled
+    unsure = at_rest & ~converged
     found = at_rest & (
-        settled | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
+        converged | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
     )
     return Solved(jnp.where(found, z, jnp.nan), found, num_iterations)
 
@@ -177,20 +177,20 @@ def at_rest_near(
         better = then <= (1 - share / 2) * before
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
-        settled = better & (share == 1) & (then * then <= eps * before)
+        converged = better & (share == 1) & (then * then <= eps * before)
         # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
         # helping.
         stuck = ~better & (before <= eps**0.5)
         # A share of the root of roundoff still changes half of the digits of the unknown.
         going = ~stuck & (before < jnp.inf) & (better | (share * BACKTRACKING_FACTOR > eps**0.5))
-        z = jnp.where(better, trial, z) + jnp.where(settled, after, 0)
+        z = jnp.where(better, trial, z) + jnp.where(converged, after, 0)
         longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
         share = jnp.where(better, longer, shorter)
-        at_rest = (settled | (~going & (before < jnp.inf))) & factored.regular()
-        return keep_done(tests_left, (z, share, settled), now), left_after_step(
+        at_rest = (converged | (~going & (before < jnp.inf))) & factored.regular()
+        return keep_done(tests_left, (z, share, converged), now), left_after_step(
             at_rest, going, tests_left
         )
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(False)
-    (z, _, settled), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
-    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, settled)
+    (z, _, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
+    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, converged)

@@ -197,8 +197,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
                 # A change by the roundoff of the state cannot become smaller.
                 rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
-                settled = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-                then = left_after_step(settled, rate < 2, tests_left)
+                converged = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
+                then = left_after_step(converged, rate < 2, tests_left)
                 return keep_done(tests_left, (new, now_size), now), then
 
             begin = guess, jnp.asarray(jnp.inf, start.dtype)

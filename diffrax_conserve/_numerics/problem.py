@@ -188,7 +188,7 @@ class Problem(eqx.Module):
         num_iterations: IntScalarLike = 1,
         *,
         ok: Bool[Array, ""] | None = None,
-        settled: Bool[Array, ""] | bool = False,
+        converged: Bool[Array, ""] | bool = False,
     ) -> ProjectionInfo:
         """The report on a projection from `candidate` to `y`, as `solve` must return it.
 
@@ -197,7 +197,7 @@ class Problem(eqx.Module):
         - `num_iterations`: the number of iterations.
         - `ok`: whether the projection succeeded, if that is known. By default: whether every
             residual is within its tolerance at `y`,
-        - `settled`: or whether this tells that it succeeded.
+        - `converged`: or whether the iteration tells that it succeeded.
         """
         # A report has no derivative.
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
@@ -207,7 +207,7 @@ class Problem(eqx.Module):
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
         is_on_manifold = problem.level(after, scale)[0] >= WITHIN_TOLERANCE
-        success = (settled | is_on_manifold) if ok is None else ok
+        success = (converged | is_on_manifold) if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence

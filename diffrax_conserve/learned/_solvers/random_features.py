@@ -220,8 +220,8 @@ def _newton(equations: StepEquations, start: Coefficients) -> Solved:
         states, residual = equations.states(coefficients), equations.residual(coefficients)
         change = equations.solve_linear(equations.jacobians(states), residual)
         size = jnp.max(jnp.abs(equations.states(change) - equations.y0))
-        settled = size <= tolerance * jnp.max(jnp.abs(states))
-        then = left_after_step(settled, jnp.isfinite(size), tests_left)
+        converged = size <= tolerance * jnp.max(jnp.abs(states))
+        then = left_after_step(converged, jnp.isfinite(size), tests_left)
         return keep_done(tests_left, coefficients - change, coefficients), then
 
     found = iterate(advance, start, max_steps=_MAX_STEPS)
