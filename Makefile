@@ -173,7 +173,7 @@ examples: $(TEST) ## execute the code blocks of the README, the first pages and 
 	$(BIN)/python -m pytest $(SHARED) -qq -m "examples and not slow" tests/test_docs.py
 	@echo "Every example ran."
 
-COSTS := scaling balance dae stiff
+COSTS := scaling balance dae stiff large compiler_option
 TRAININGS := zoo paper chemistry worth
 STUDIES := long_run verdict
 PUBLISHED := sundials homproj_paper heyoka_page discrete_gradient julia_energy mechanisms \
@@ -195,7 +195,7 @@ bench-published: $(BENCH) ## compare with what others published; tables of a pag
 	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
 	$(BIN)/python benchmarks/published/tables.py --write
 
-SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints cost/large $(STUDIES:%=studies/%) learned/chemistry \
+SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) learned/chemistry \
   $(PUBLISHED:%=published/%)
 SMOKED ?= cost/balance learned/chemistry studies/long_run published/mechanisms
 

@@ -8,6 +8,8 @@ the tables of the pages to the results.
 import argparse
 import math
 import runpy
+import statistics
+from collections.abc import Iterable
 from typing import Any
 
 import matplotlib as mpl
@@ -19,7 +21,7 @@ ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
 FILES = ("performance", "many-constraints", "differential-algebraic", "large-stiff")
 PAGES = [DOCS / f"{x}.md" for x in FILES]
-NAMES = ("scaling", "many_constraints", "dae", "large")
+NAMES = ("scaling", "many_constraints", "dae", "large", "compiler_option")
 # Of each system: the integrals that are kept, and the numbers in its state.
 SIZES = {"rigid body": (2, 3), "three vortices": (4, 6), "ten vortices": (4, 20)}
 
@@ -92,6 +94,26 @@ def large_table(results: Results) -> list[str]:
     return lines
 
 
+def first_call_table(results: Results) -> list[str]:
+    """The first call of ten systems, and what the option of the compiler does to both times."""
+    heads = "system | plain, s | projected, s | over plain | with the option, s | run time with it"
+    lines = [f"| {heads} |", "|" + "---|" * 6]
+    rows = results["compiler_option"]["systems"]
+    kinds = ("plain", "projected", "with the option")
+    found = []
+    for name, row in rows.items():
+        plain, kept, quick = (row[kind]["first"] for kind in kinds)
+        slower = row["with the option"]["seconds"] / row["projected"]["seconds"]
+        found.append((plain, kept, kept / plain, quick, slower))
+        lines.append(f"| {name.replace('-', ' ')} | {_cells(found[-1])} |")
+    middle = [statistics.median(column) for column in zip(*found, strict=True)]
+    return [*lines, f"| median | {_cells(middle)} |"]
+
+
+def _cells(numbers: Iterable[float]) -> str:
+    return " | ".join(f"{x:.1f}" for x in numbers)
+
+
 def machine_lines(results: Results) -> list[str]:
     """One line: what `scaling.py` ran on, and when it began."""
     about = results["scaling"]["machine"]
@@ -111,6 +133,7 @@ def tables(results: Results) -> dict[str, list[str]]:
         "many constraints": many_table(results),
         "beside IDA": dae_table(results),
         "large beside IDA": large_table(results),
+        "first call": first_call_table(results),
     }
 
 
