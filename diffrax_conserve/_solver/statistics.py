@@ -22,7 +22,7 @@ _MAX_PLAUSIBLE = 10
 
 @final
 class ProjectionStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve, a failed step that ended it, and the earlier solves
+    """Totals over the accepted steps of a solve, a failed step that ended it, and earlier solves
     that it continues.
 
     **Attributes:**
