@@ -30,7 +30,7 @@ from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
 
 
 @final
-class Packed(eqx.Module):
+class AsArrays(eqx.Module):
     """A `Target`, or another module, in the form in which `dense_info` can store it. diffrax copies
     the leaves of `dense_info` into arrays over the steps, so that only arrays may be leaves."""
 
@@ -78,7 +78,7 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     step_correction: Float[Array, " n"]
     step_norm: Float[Array, ""]
     error: Float[Array, " n"] | None
-    target: Packed
+    target: AsArrays
 
     @eqx.filter_jit  # traced once for all saved times
     def evaluate(

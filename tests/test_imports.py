@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._solver.diffrax_private import member, register
+from diffrax_conserve._solver.diffrax_private import register, result_at
 
 from .learned import LORENZ, flow_map, unchecked
 
@@ -180,7 +180,7 @@ def test_a_registered_message_is_a_result_like_those_of_diffrax(errors_raise):
     try:
         first = register("the moon is in the way")
         assert messages == [*before, "diffrax_conserve: the moon is in the way"]
-        result = eqx.filter_jit(member)(jnp.asarray(first))
+        result = eqx.filter_jit(result_at)(jnp.asarray(first))
         assert dfx.RESULTS[result] == messages[-1]
         assert dfx.RESULTS[dfx.RESULTS.successful] == ""
         chosen = dfx.RESULTS.where(result != dfx.RESULTS.successful, result, dfx.RESULTS.successful)

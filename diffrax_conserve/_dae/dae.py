@@ -29,7 +29,7 @@ from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_function
-from .._projection.base import AbstractProjection, adapted, check_projection
+from .._projection.base import AbstractProjection, check_projection, with_options
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
@@ -668,7 +668,7 @@ def _consistent(
         projection = SimplifiedNewton(metric=metric, max_steps=MAX_NEWTON_STEPS)
         vector = ravel(y)
         problem = problem_of(manifold, none, t, y, args, cancellation)
-        found, info = projection.solve(adapted(problem, projection, vector), vector)
+        found, info = projection.solve(with_options(problem, projection, vector), vector)
         return unravel(found, y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.

@@ -117,7 +117,7 @@ def written(
     return evaluated
 
 
-def alone_or_batched(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
+def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     """`run(given, lanes)` as a function of `given`, where `lanes` tells whether it is batched.
 
     Both forms are jitted, so that JAX traces each once, although it batches the loop over the steps
@@ -141,7 +141,7 @@ def alone_or_batched(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     return call
 
 
-def scalarised_loop(
+def loop_in_scalars(
     start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, tests_left: Array
 ) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
     """The functions of a loop, `first = start(y)` and `y, tests_left = advance(first, y,

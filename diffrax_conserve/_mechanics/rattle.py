@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from .._constants import MAX_STEPS, MAX_UNROLLED
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
-from .._interpolation import Packed
+from .._interpolation import AsArrays
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, iterate, keep_done, left_after_test
@@ -178,10 +178,10 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
             return jax.jvp(fn, (t, q), (jnp.ones_like(t), drift(t, v, args)))[1]
 
         start, along = (t, q, v), (jnp.ones_like(t), drift(t, v, args), kick)
-        active = jax.jvp(slope, start, along)[1]
+        to_correct = jax.jvp(slope, start, along)[1]
         _, jacobian = problem.linearise(ravel(q))
         gram = self._gram(problem, jacobian, self._drift(terms, t, v, args), ravel(v))
-        return unflatten(gram.solve(-active), values)
+        return unflatten(gram.solve(-to_correct), values)
 
     def init(
         self,
@@ -272,7 +272,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         ok = found & keeps
         cause = failure_cause(ok, state.off, state.cancellation, jnp.concatenate([q1, v1]))
         (q1, v1), result = masked_step(cause, (q1, v1), dfx.RESULTS.successful)
-        dense_info = dict(y0=y0, step=Packed(StepOf(self, given_terms, args, state)))
+        dense_info = dict(y0=y0, step=AsArrays(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
         state = _State(at, slope, multiplier, state.cancellation, state.off)
         return (unravel(q1, q0), unravel(v1, v0)), None, dense_info, state, result
@@ -380,8 +380,8 @@ def _on_tangent(
     def iterated(product: Any, b: Array) -> Array:
         return iterative_refinement(solve, product, b)
 
-    active = rate + at.jacobian.matvec(drift(p))
-    x = lax.custom_linear_solve(product, -active, iterated, iterated, symmetric=True)
+    to_correct = rate + at.jacobian.matvec(drift(p))
+    x = lax.custom_linear_solve(product, -to_correct, iterated, iterated, symmetric=True)
     v = p + _impulse(problem, x, at.jacobian)
     # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
     # velocities is that of the terms, and not of their sum.

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from .._custom_types import RealScalarLike, Y
-from .._interpolation import Packed
+from .._interpolation import AsArrays
 from .._tree import tree_sub
 
 
@@ -32,7 +32,7 @@ class ShorterStep(dfx.AbstractLocalInterpolation):
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     t1: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
     y0: Y
-    step: Packed
+    step: AsArrays
 
     @eqx.filter_jit  # traced once for all saved times
     def evaluate(

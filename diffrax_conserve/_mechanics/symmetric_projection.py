@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from .._balance import refuse_rates
 from .._constants import MAX_STEPS, NOISE, ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
-from .._interpolation import Packed
+from .._interpolation import AsArrays
 from .._manifold import check_manifold
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_test
@@ -28,7 +28,7 @@ from .._numerics.problem import (
     problem_of,
 )
 from .._numerics.rows import AbstractRows, solve_kkt
-from .._projection.base import adapted
+from .._projection.base import with_options
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.failure import failure_cause, masked_step, starts_off_manifold
@@ -192,7 +192,7 @@ class SymmetricProjection(ForwardingSolver):
         cause = failure_cause(info.ok, off, state.values, y1 - candidate)
         y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
         y1, result = masked_step(cause, y1, result)
-        dense_info = dict(y0=y0, step=Packed(StepOf(self, terms, args, state)))
+        dense_info = dict(y0=y0, step=AsArrays(StepOf(self, terms, args, state)))
         statistics = state.statistics.add(info, None)
         state = _State(state.inner, state.values, state.cancellation, multiplier, statistics)
         return unravel(y1, y0), None, dense_info, state, result
@@ -200,7 +200,7 @@ class SymmetricProjection(ForwardingSolver):
     def _problem(self, t: RealScalarLike, y0: Y, args: Args, state: _State) -> Problem:
         """The problem at a time of the vector field, with the metric at the start of the step."""
         problem = problem_of(self.manifold, state.values, t, y0, args, state.cancellation)
-        return adapted(problem, self.projection, ravel(y0))
+        return with_options(problem, self.projection, ravel(y0))
 
 
 SymmetricProjection.__init__.__doc__ = r"""**Arguments:**
@@ -255,7 +255,7 @@ def _solved(
     def advance(now: _Unknowns, tests_left: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
         rows = end.factor.scale_columns(jacobian)
-        level, active = end.level(g, end.scale(jacobian, now.y))
+        level, to_correct = end.level(g, end.scale(jacobian, now.y))
         # The residual of the equation for the state, with the gradients at that state.
         defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
         off = end.factor.norm(defect) / (eps * end.factor.norm(jnp.abs(y0) + jnp.abs(now.y)))
@@ -271,7 +271,7 @@ def _solved(
         def move() -> _Unknowns:
             scaled = rows.divide_rows(sizes)
             gram = jtu.tree_map(jnp.add, gram0, scaled.gram(scaled))
-            change = gram.solve((active + jacobian.matvec(defect)) / sizes) / sizes
+            change = gram.solve((to_correct + jacobian.matvec(defect)) / sizes) / sizes
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)

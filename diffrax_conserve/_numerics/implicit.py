@@ -38,11 +38,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def equations(self, unknowns: Any) -> Any:
-        """`F` at these unknowns. It is only differentiated, by the arrays of the system."""
+        """`F` at these unknowns. Only its tangent by the arrays of the system is used."""
 
     @abc.abstractmethod
-    def solve_linearised(self, solved: Solved, rhs: Any) -> Any:
-        """`(∂F/∂x)⁻¹ rhs`, for the unknowns that the iteration returns."""
+    def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
+        """`-(∂F/∂x)⁻¹ t_equations`, of which the unknowns that the iteration returns."""
 
 
 @eqx.filter_custom_jvp
@@ -56,9 +56,8 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     (system,), (t_system,) = primals, tangents
     solved = implicit_solution(system)
     x = system.unknowns(solved)
-    equations, t_defect = eqx.filter_jvp(lambda system: system.equations(x), (system,), (t_system,))
-    rhs = tree_tangents(equations, t_defect)
-    tangent = system.solve_linearised(solved, jtu.tree_map(jnp.negative, rhs))
+    values, t_values = eqx.filter_jvp(lambda system: system.equations(x), (system,), (t_system,))
+    tangent = system.solve_linearised(solved, tree_tangents(values, t_values))
     none = jtu.tree_map(lambda _: None, solved)
     return solved, none._replace(y=tangent)
 
@@ -70,7 +69,7 @@ class MultiplierSystem(AbstractSystem):
 
     The equations are `y = ŷ + S Uᵀ λ` and `g(y) = 0`. The first gives the state, so that the only
     unknowns are the multipliers `λ`. But what is wanted is the derivative of the state. So
-    `equations` returns both sides that depend on the parameters, `ŷ + S Uᵀ λ` and `g` there.
+    `equations` returns two expressions, the state `ŷ + S Uᵀ λ`, and `g` there.
 
     Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
     derivative would divide the error of the candidate's derivative by the sine of their angle. In
@@ -132,10 +131,10 @@ class MultiplierSystem(AbstractSystem):
         # Both are evaluated at the state, so that the tangent of `g` contains that of the state.
         return end, self.problem.residual(end)
 
-    def solve_linearised(self, solved: Solved, rhs: tuple[Array, Array]) -> Array:
+    def solve_linearised(self, solved: Solved, t_equations: tuple[Array, Array]) -> Array:
         """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
-        t_y, t_g = (-x for x in rhs)
+        t_y, t_g = t_equations
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
         row_norms, rows = problem.gradients(y).unit()
@@ -182,9 +181,9 @@ class SquareSystem(AbstractSystem):
     def equations(self, unknowns: Any) -> Any:
         return self.residual(unknowns)
 
-    def solve_linearised(self, solved: Solved, rhs: Any) -> Any:
+    def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
         matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, solved.y))))
-        return unflatten(self.solve(matrix(_flat(solved.y)), _flat(rhs)), solved.y)
+        return unflatten(self.solve(matrix(_flat(solved.y)), -_flat(t_equations)), solved.y)
 
 
 def root(

@@ -38,7 +38,7 @@ from .._constants import (
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
 )
-from .._fast.scalars import alone_or_batched, joined, scalarised_loop
+from .._fast.scalars import joined, loop_in_scalars, with_batch_flag
 from .linear import permuted, pivot_order, roundoff_pivot_tolerance
 from .problem import (
     ABOVE_TOLERANCE,
@@ -165,16 +165,16 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
-    For up to four constraints, `directions` takes their place; without `directions`, the rows are
-    the gradients at the current state after `FROZEN_STEPS` iterations."""
+    For up to four constraints they are `directions` if these are given, and otherwise, after
+    `FROZEN_STEPS` iterations, the gradients at the current state."""
     if problem.magnitude.size > MAX_UNROLLED:
         return _with_frozen_jacobian(problem, candidate, max_steps)
-    return alone_or_batched(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
+    return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
         (problem, candidate, directions)
     )
 
 
-def _with_fresh_jacobians(given: Any, lanes: bool, *, max_steps: int) -> Solved:
+def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> Solved:
     """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     problem, candidate, directions = given
@@ -193,21 +193,21 @@ def _with_fresh_jacobians(given: Any, lanes: bool, *, max_steps: int) -> Solved:
         order, fixed = invariants
         linearised = problem.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
-        g, jacobian = linearised if lanes else lax.optimization_barrier(linearised)
-        level, active = problem.level(g, problem.scale(jacobian, y))
+        g, jacobian = linearised if is_batched else lax.optimization_barrier(linearised)
+        level, to_correct = problem.level(g, problem.scale(jacobian, y))
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
-        rows, active = permuted(order, rows.matrix), permuted(order, active / row_scales)
+        rows, to_correct = permuted(order, rows.matrix), permuted(order, to_correct / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
-        # Before the step that polishes the test sets the number of tests to two, so we compute the
-        # number of steps from its value before the test. Should that step leave the tolerance, the
-        # one that tries to return is along the gradients at its state.
+        # `left_after_test` sets the number of tests to two when it asks for a step that polishes,
+        # so the steps are counted by its value before. If that step leaves the tolerance, the next
+        # one is along the gradients at its state.
         frozen = tests_left > max_steps + 1 - FROZEN_STEPS
         current = jnp.where(frozen, fixed, rows) if may_switch else fixed
         tests_left = left_after_test(level, tests_left)
-        # A step that only polishes is as long as roundoff over the sine of the angle between
-        # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, a
-        # constraint whose gradient is more nearly parallel to others takes no part in it. In
-        # float64 it is short in any case, and a batch is faster without the distinction.
+        # A step that only polishes is as long as roundoff divided by the sine of the angle between
+        # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle,
+        # constraints with a sine of at most `1 / ROUNDOFF` take no part in it. In float64 it is
+        # short in any case, and a batch is faster without the distinction.
         pivot_tolerance = None
         if dtype != jnp.float64:
             pivot_tolerance = jnp.where(
@@ -215,19 +215,20 @@ def _with_fresh_jacobians(given: Any, lanes: bool, *, max_steps: int) -> Solved:
             )
         rows, current = DenseRows(rows), DenseRows(current)
         change = rows.gram(current).row_space_correction(
-            current, active, pivot_tolerance=pivot_tolerance, presorted=True
+            current, to_correct, pivot_tolerance=pivot_tolerance, presorted=True
         )
         newton_point = y - problem.factor.to_state(change)
         return keep_done(tests_left, newton_point, y), tests_left
 
-    if lanes:
+    if is_batched:
         tests_left = initial_tests(max_steps)
-        found, step, y = scalarised_loop(loop_invariants, advance, candidate, tests_left)
+        # In arrays, if that would be too large.
+        invariants_of, advance, y = loop_in_scalars(loop_invariants, advance, candidate, tests_left)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        found, step, y = loop_invariants, advance, lax.optimization_barrier(candidate)
-    solved = iterate(ft.partial(step, found(y)), y, max_steps=max_steps)
+        invariants_of, y = loop_invariants, lax.optimization_barrier(candidate)
+    solved = iterate(ft.partial(advance, invariants_of(y)), y, max_steps=max_steps)
     return solved._replace(y=joined(candidate, solved.y))
 
 
@@ -255,9 +256,9 @@ def _with_frozen_jacobian(
         return problem.factor.to_state(gradients.rmatvec(multiplier))
 
     def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
-        level, active = problem.level(problem.residual(y), scale)
+        level, to_correct = problem.level(problem.residual(y), scale)
         tests_left = left_after_test(level, tests_left)
-        move = lambda: y - combination(solve(active / row_scales) / row_scales)  # noqa: E731
+        move = lambda: y - combination(solve(to_correct / row_scales) / row_scales)  # noqa: E731
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
         return keep_done(tests_left, moved, y), tests_left
 
@@ -297,7 +298,7 @@ def damped_newton(
         y, first = now.y, now.largest == jnp.inf
         g, jacobian = lax.optimization_barrier(problem.linearise(y))
         scale_at_y = problem.scale(jacobian, y)
-        level, active = problem.level(g, scale_at_y)
+        level, to_correct = problem.level(g, scale_at_y)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
         level = jnp.where(first, level, jnp.maximum(level, ABOVE_TOLERANCE))
         tests_left = left_after_test(level, tests_left, polish=polish)
@@ -306,7 +307,7 @@ def damped_newton(
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
         current = rows if directions is None else directions
-        change = rows.gram(current).row_space_correction(current, active / row_scales)
+        change = rows.gram(current).row_space_correction(current, to_correct / row_scales)
         newton_point = y - problem.factor.to_state(change)
         backtracked = now.best + BACKTRACKING_FACTOR * (y - now.best)
         best = jnp.where(is_smaller, y, now.best)

@@ -93,9 +93,8 @@ def forward_elimination(
     size = [jnp.abs(gram[k, k]) for k in range(m)]
     right, reduced_rows, order = list(b), list(rows), []
     for k in range(m):
-        for i in (
-            range(k + 1, m) if k and not presorted else ()
-        ):  # the first pivots, divided by the diagonal, are one
+        # At `k = 0` all quotients are one, so that nothing is exchanged.
+        for i in range(k + 1, m) if k and not presorted else ():
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             order.append(larger)
             for each in (*matrix[k:], matrix, size, right, reduced_rows):
@@ -103,10 +102,8 @@ def forward_elimination(
         pivot = jnp.where(jnp.abs(matrix[k][k]) > pivot_tolerance * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
             below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
-            right[i], reduced_rows[i] = (
-                right[i] - below * right[k],
-                reduced_rows[i] - beside * reduced_rows[k],
-            )
+            right[i] = right[i] - below * right[k]
+            reduced_rows[i] = reduced_rows[i] - beside * reduced_rows[k]
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - below * matrix[k][j]
         right[k] = right[k] / pivot

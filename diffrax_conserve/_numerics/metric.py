@@ -31,9 +31,9 @@ from .rows import AbstractRows, DenseRows
 class AbstractFactor(eqx.Module):
     """A factor `S` of `M⁻¹ = S Sᵀ`, as products with it and with its inverse.
 
-    All linear algebra works with `G S`, whose columns are dimensionless. So nothing is squared
-    before it is scaled, which could overflow, and a change of units by powers of two changes no bit
-    of the result.
+    All linear algebra works with `G S`, whose columns do not have the units of the state. So
+    nothing is squared before it is scaled, which could overflow, and a change of units by powers of
+    two changes no bit of the result.
     """
 
     # Whether the product of a sparse row with `S` is dense.

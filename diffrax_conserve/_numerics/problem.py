@@ -162,15 +162,16 @@ class Problem(eqx.Module):
         and the residuals that are to be corrected, with zeros for those that are noise."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
-        # A tolerance that has underflowed, or is infinite, would accept any state, so it counts as
-        # not met. If the scale is exactly zero, all terms are zero, and so is the residual.
+        # Where a tolerance underflows, the residual does so too, and nothing exceeds an infinite
+        # one. Either would accept any state, so it counts as not met. If the scale is exactly zero,
+        # all terms are zero, and so is the residual.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
-        on = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
+        met_tolerance = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be
         # shorter, but on a CPU a maximum can lose a NaN.
         within = jnp.where(noise, jnp.int8(AT_ROUNDOFF), jnp.int8(WITHIN_TOLERANCE))
         beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(ABOVE_TOLERANCE), jnp.int8(NOT_FINITE))
-        return jnp.min(jnp.where(on, within, beyond)), jnp.where(noise, 0, g)
+        return jnp.min(jnp.where(met_tolerance, within, beyond)), jnp.where(noise, 0, g)
 
     def is_on_manifold(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
@@ -195,9 +196,9 @@ class Problem(eqx.Module):
         **Arguments:**
 
         - `num_iterations`: the number of iterations.
-        - `ok`: whether the projection succeeded, if that is known. By default: whether every
-            residual is within its tolerance at `y`,
-        - `converged`: or whether the iteration tells that it succeeded.
+        - `ok`: whether the projection succeeded. By default: whether every residual is within
+            its tolerance at `y`, or `converged`.
+        - `converged`: whether the iteration tells that it succeeded.
         """
         # A report has no derivative.
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
@@ -206,8 +207,10 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        is_on_manifold = problem.level(after, scale)[0] >= WITHIN_TOLERANCE
-        success = (converged | is_on_manifold) if ok is None else ok
+        if ok is None:
+            success = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
+        else:
+            success = ok
         before, after = (jnp.max(x) for x in sizes)
         kinds = optx.RESULTS
         missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence

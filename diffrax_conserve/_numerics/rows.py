@@ -93,7 +93,7 @@ class AbstractRows(eqx.Module):
         its row, or one if all are zero.
 
         The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
-        they do not in usual units, so there the row_scales are one, which saves time.
+        they do not in usual units, so there the scales are one, which saves time.
         """
         if self.dtype == jnp.float64:
             return jnp.ones(len(self)), self
@@ -122,8 +122,9 @@ class AbstractRows(eqx.Module):
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
-    In all methods `pivot_tolerance` is the least pivot that counts, by default roundoff. Sparse
-    matrices ignore it.
+    In `solve` and in `row_space_correction` of a small matrix `pivot_tolerance` is the least pivot
+    that counts, by default roundoff. A larger matrix has it, or by default a power of roundoff,
+    added to its diagonal. Sparse matrices ignore it.
     """
 
     @abc.abstractmethod
@@ -213,8 +214,8 @@ class PivotedGram(AbstractGram):
         del pivot_tolerance
         matrix, unit = _equilibrated(self.matrix)
         one = jnp.eye(len(matrix), dtype=matrix.dtype)
-        above, below, _ = forward_elimination(matrix, one, one)
-        return _Inverses(below, above.T, unit)
+        inverse_upper_t, inverse_lower, _ = forward_elimination(matrix, one, one)
+        return _Inverses(inverse_lower, inverse_upper_t.T, unit)
 
     def solve(
         self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None

@@ -62,7 +62,9 @@ class AbstractProjection(Hashable):
         """
 
 
-def adapted(problem: Problem, projection: AbstractProjection, y: Float[Array, " n"]) -> Problem:
+def with_options(
+    problem: Problem, projection: AbstractProjection, y: Float[Array, " n"]
+) -> Problem:
     """The problem with the tolerances of a projection, and with its metric at a state, if it has
     one; otherwise it keeps its own."""
     changed: dict[str, Any] = dict(rtol=projection.rtol, atol=projection.atol)

@@ -12,7 +12,7 @@ from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._tree import ravel, tree_stop_gradient, unravel
-from .base import AbstractProjection, adapted, check_projection
+from .base import AbstractProjection, check_projection, with_options
 from .newton import Newton
 from .options import check_state
 
@@ -86,7 +86,7 @@ def _projected(
 
     def problem(cancellation: Float[Array, " m"]) -> Problem:
         asked = problem_of(manifold, values, t, candidate, args, cancellation)
-        return adapted(asked, projection, vector)
+        return with_options(asked, projection, vector)
 
     _, _, at_candidate = cancellation_scale(manifold, t, candidate, args)
     y, info = projection.solve(problem(at_candidate), vector)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from .._large.sparse import pattern_of
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
-from .base import AbstractProjection, adapted
+from .base import AbstractProjection, with_options
 
 
 @final
@@ -121,4 +121,4 @@ def _restricted(
         cancellation=problem.cancellation[rows],
         pattern=pattern_of(functions, sizes, jax.eval_shape(lambda: candidate)),
     )
-    return adapted(restricted, projection, candidate)
+    return with_options(restricted, projection, candidate)

@@ -145,7 +145,8 @@ class TangentField(eqx.Module):
         """The given field, its correction, and the multipliers.
 
         Let `ġ` be the derivative of the functions along the given field, `∂_t g + G f`. It should
-        be `rate - gain · g`, so the correction must change it by the difference of both, `active`.
+        be `rate - gain · g`, so the correction must change it by the difference of both,
+        `to_correct`.
         """
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`tangent`", jnp.inexact)
@@ -160,17 +161,17 @@ class TangentField(eqx.Module):
         t = jnp.asarray(t, jnp.result_type(float, t))
         found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
         wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (found - numbers)
-        active = (wanted - along).astype(vector.dtype)
+        to_correct = (wanted - along).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
-            """`M⁻¹ Gᵀ λ` and `λ`, where `G M⁻¹ Gᵀ λ = active`. The rows of `G` are divided by their
-            sizes, and so is the right side."""
-            vector, active = given
+            """`M⁻¹ Gᵀ λ` and `λ`, where `G M⁻¹ Gᵀ λ = to_correct`. The rows of `G` are divided by
+            their sizes, and so is the right side."""
+            vector, to_correct = given
             _, jacobian = problem.linearise(vector)
             sizes, rows = problem.factor.scale_columns(jacobian).scaled()
-            gram, right = rows.gram(rows), active / sizes
+            gram, right = rows.gram(rows), to_correct / sizes
             change = problem.factor.to_state(gram.row_space_correction(rows, right))
             return change, gram.solve(right) / sizes
 
-        correction, multiplier = scalarised_result(solved, (vector, active))
+        correction, multiplier = scalarised_result(solved, (vector, to_correct))
         return slope, unravel(correction, y), unflatten(multiplier, values)

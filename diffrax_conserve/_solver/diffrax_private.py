@@ -31,7 +31,7 @@ def register(*messages: str) -> int:
     return len(known) - len(messages)
 
 
-def member(index: IntScalarLike) -> dfx.RESULTS:
+def result_at(index: IntScalarLike) -> dfx.RESULTS:
     """The result with the given index in the list."""
     kind = type(dfx.RESULTS.successful)
     return kind(jnp.asarray(index, jnp.int32), dfx.RESULTS)  # pyright: ignore

@@ -16,7 +16,7 @@ from .._custom_types import BoolScalarLike, Manifold, RealScalarLike
 from .._manifold import Constraint, is_entry
 from .._numerics.problem import Problem
 from .._tree import eps_of
-from .diffrax_private import member, register
+from .diffrax_private import register, result_at
 
 _ENTRY = (
     "`print(diffrax_conserve.statistics(sol))`, with `SaveAt(solver_state=True)`, names the entry."
@@ -59,11 +59,12 @@ def starts_off_manifold(
 ) -> Bool[Array, ""]:
     """Whether a residual at a state exceeds its tolerance, and also `√ε` of its scale.
 
-    Integrals with a `value` of their own are not tested, because the first projection moves the
-    state there, nor those whose scale is NaN, as that of the speed is at rest. `√ε` is usually much
-    larger than the tolerance of a projection, because initial states are often given with a few
-    digits less. The scale contains the changes of the state in a step, because all terms may be
-    roundoff at one state, such as those of `q · v = 0` where a component of a pendulum passes zero.
+    Not tested are integrals with a `value` of their own, because the first projection moves the
+    state there, and integrals whose gradient is NaN, as that of the speed is at rest. `√ε` is
+    usually much larger than the tolerance of a projection, because initial states are often given
+    with a few digits less. The scale contains the changes of the state in a step, because all terms
+    may be roundoff at one state, such as those of `q · v = 0` where a component of a pendulum
+    passes zero.
     """
     g, jacobian = problem.linearise(y)
     scale = problem.scale(jacobian, y)
@@ -90,16 +91,20 @@ def failure_cause(
 ) -> Int[Array, ""]:
     """Why a step failed, 0 if it did not.
 
+    - `values`: the conserved values, or what else must be known from the start of the solve.
     - `must_be_finite`: the state at its end, or the correction.
-    - `unreachable`: whether the failure says that there is no state on the manifold, instead of
-      advising shorter steps.
+    - `unreachable`: whether a manifold that was not reached is reported as having no state, instead
+      of advising shorter steps.
     """
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
-    finite, known = jnp.abs(jnp.sum(must_be_finite)) < jnp.inf, jnp.all(jnp.isfinite(values))
+    finite, finite_values = (
+        jnp.abs(jnp.sum(must_be_finite)) < jnp.inf,
+        jnp.all(jnp.isfinite(values)),
+    )
     cause = jnp.where(ok, 0, jnp.where(unreachable, _NO_STATE, _NOT_REACHED))
     cause = jnp.where(ok & too_far, _TOO_FAR, cause)
     cause = jnp.where(cannot_start, _START, cause)
-    return jnp.where(known & (finite | (cause == 0)), cause, _NOT_FINITE)
+    return jnp.where(finite_values & (finite | (cause == 0)), cause, _NOT_FINITE)
 
 
 def is_shortest_step(
@@ -128,7 +133,7 @@ def masked_step(
     projection ends after one iteration. If the wrapped solver has failed by itself, its own
     `result` is kept, unless the step could not start."""
     failed = (cause > 0) & ((result == dfx.RESULTS.successful) | (cause == _START))
-    result = dfx.RESULTS.where(failed, member(FIRST_RESULT - 1 + cause), result)
+    result = dfx.RESULTS.where(failed, result_at(FIRST_RESULT - 1 + cause), result)
     return jtu.tree_map(lambda y: jnp.where(cause > 0, jnp.nan, y), y), result
 
 

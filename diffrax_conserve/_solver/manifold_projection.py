@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from .._balance import has_rates
 from .._constants import ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
-from .._interpolation import MakeManifoldInterpolation, Packed
+from .._interpolation import AsArrays, MakeManifoldInterpolation
 from .._manifold import Constraint, check_manifold, named_entries
 from .._numerics.iterate import any_lane
 from .._numerics.metric import Diagonal, Identity
@@ -221,20 +221,20 @@ class ManifoldProjection(ForwardingSolver):
         state = self._checked(solver_state)
         wrapped = self._wrapped_step(terms, t0, t1, y0, args, state.inner, made_jump)
         step, candidate = wrapped.step, wrapped.candidate
-        # Dense output stores the target at the start, and integrates the rates from there.
-        state, start = self._target(terms, state, wrapped, y0, args)
-        target = start.add_rates(step.t0, step.t1, wrapped.path)
+        # Dense output stores the target at the start, and adds the integrals up to its own time.
+        state, start_target = self._target(terms, state, wrapped, y0, args)
+        target = start_target.add_rates(step.t0, step.t1, wrapped.path)
         y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
-        cause, final = self._verdict(start, state, wrapped, y1, info, made_jump)
+        cause, is_final = self._verdict(start_target, state, wrapped, y1, info, made_jump)
         y1, result = masked_step(cause, y1, wrapped.result)
-        metric = start.metric(step.t0, step.y0)
+        metric = start_target.metric(step.t0, step.y0)
         dense_info = dict(
             inner=wrapped.dense_info,
             field_time=wrapped.field_time,
             step_correction=y1 - candidate,
             step_norm=step_norm(step.y0, y1, metric),
             error=step.error if self.projection.sees_step else None,
-            target=Packed(start),
+            target=AsArrays(start_target),
         )
         error_norm = None if step.error is None else metric.norm(step.error)
         state = dataclasses.replace(
@@ -244,7 +244,7 @@ class ManifoldProjection(ForwardingSolver):
             last_checksum=_checksum(y1)[0],
             statistics=state.statistics.add(info, error_norm),
         )
-        error = error_for_controller(cause, final, wrapped.error)
+        error = error_for_controller(cause, is_final, wrapped.error)
         return unravel(y1, y0), error, dense_info, state, result
 
     def _wrapped_step(
@@ -259,7 +259,7 @@ class ManifoldProjection(ForwardingSolver):
     ) -> "_WrappedStep":
         """The step of the wrapped solver. From here on states are vectors, and times those of the
         vector field."""
-        inner_made_jump = made_jump if self._keeps_slope else True
+        inner_made_jump = made_jump if self._forwards_made_jump else True
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, inner_made_jump
         )
@@ -272,16 +272,17 @@ class ManifoldProjection(ForwardingSolver):
         return _WrappedStep(step, ravel(y1), path, error, dense_info, inner, result, field_time)
 
     @property
-    def _keeps_slope(self) -> bool:
-        """Whether the wrapped solver gets the `made_jump` of diffrax, and not `True` in every step.
+    def _forwards_made_jump(self) -> bool:
+        """Whether the wrapped solver gets the `made_jump` of diffrax; otherwise it gets `True` in
+        every step.
 
         A solver with the property "first same as last" keeps the slope at the candidate for the
         next step, which starts at the projected state. With `made_jump=True` it evaluates the slope
         there anew. The flag is set in every step, because while one lane of a batch is in its first
         step, diffrax evaluates the slope of all lanes anew, so that otherwise a lane would depend
-        on the others. There are two exceptions. In an implicit method the kept slope fits the last
-        stage, which its root finder has solved; a slope at the projected state would amplify the
-        error of the root finder. `QUICSORT` refuses `made_jump=True`.
+        on the others. The flag of diffrax is passed on in two cases. In an implicit method the kept
+        slope fits the last stage, which its root finder has solved; a slope at the projected state
+        would amplify the error of the root finder. `QUICSORT` refuses `made_jump=True`.
         """
         return isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
 
@@ -306,10 +307,11 @@ class ManifoldProjection(ForwardingSolver):
         like: Y,
         args: Args,
     ) -> tuple[State, Target]:
-        """The state with the units and directions of this step, and the target at its start.
+        """The solver state with the units and displacements of this step, and the target at the
+        start of the step.
 
-        Noise has no metric of motion: with noise the metric decides which equation is solved, and
-        that must not depend on the path.
+        Stochastic equations have no metric of motion: there the metric decides which equation is
+        solved, and that must not depend on the path.
         """
         step, candidate, displacements = wrapped.step, wrapped.candidate, state.displacements
         changes = jnp.abs(candidate - step.y0)
@@ -344,13 +346,11 @@ class ManifoldProjection(ForwardingSolver):
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
         step, candidate = wrapped.step, wrapped.candidate
         cannot_start = self._cannot_start(target, state, step, made_jump)
-        step_size, first_step_size = (
-            step.t1 - step.t0,
-            state.first_step_size.astype(jnp.result_type(step.t1)),
-        )
+        first_step_size = state.first_step_size.astype(jnp.result_type(step.t1))
         time = jnp.maximum(jnp.abs(step.t1), first_step_size)
-        final = cannot_start | is_shortest_step(step_size, time, target.changes, candidate)
-        correction, too_far = y1 - candidate, jnp.asarray(False)
+        step_size = step.t1 - step.t0
+        is_final = cannot_start | is_shortest_step(step_size, time, target.changes, candidate)
+        correction, too_far = y1 - candidate, False
         if self.max_correction is not None:
             metric = target.metric(step.t0, step.y0)
             limit = jnp.asarray(self.max_correction, correction.dtype)
@@ -363,35 +363,35 @@ class ManifoldProjection(ForwardingSolver):
             state.values,
             must_be_finite=correction,
             too_far=too_far,
-            unreachable=is_first_step | final,
-        ), final
+            unreachable=is_first_step | is_final,
+        ), is_final
 
     def _cannot_start(
         self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off the manifold. The second is
-        tested if the state is not the end of the last step, as at the start of a solve, and after a
-        jump of the vector field, because a constraint may jump with it."""
+        tested where the state is not the end of the last step, as at the start of a solve, and
+        after a jump of the vector field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         entries = [entry for _, entry in named_entries(self.manifold)]
         if not any(map(binds_start, entries)):
             return invalid_values
-        # XLA may add in another order, so we compare up to roundoff. A state that is NaN, for which
-        # the comparison is false, has failed already.
+        # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
+        # comparison is false, and its projection fails.
         checksum, size = _checksum(step.y0)
         roundoff = ROUNDOFF * eps_of(size) * size
         starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
-        problem = target.problem(step.t0, step.y0)
         off = lax.cond(
             any_lane(starts_elsewhere),
-            lambda: starts_off_manifold(problem, entries, step.y0),
+            lambda: starts_off_manifold(target.problem(step.t0, step.y0), entries, step.y0),
             lambda: jnp.asarray(False),
         )
         return invalid_values | (starts_elsewhere & off)
 
 
 def _checksum(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """A weighted sum of the components, by which a state is recognised, and that of their sizes."""
+    """A weighted sum of the components, by which a state is recognised, and the sum of the absolute
+    terms, to which its roundoff is proportional."""
     terms = irregular_weights(y.size, y.dtype) * y
     return jnp.sum(terms), jnp.sum(jnp.abs(terms))
 

@@ -37,7 +37,7 @@ class State(eqx.Module):
     units: Float[Array, " n"]
     last_checksum: Float[Array, ""]
     statistics: ProjectionStatistics
-    displacements: Float[Array, "k n"] | None = None
+    displacements: Float[Array, "k n"] | None
 
     @property
     def values(self) -> Float[Array, " m"]:

@@ -22,7 +22,8 @@ _MAX_PLAUSIBLE = 10
 
 @final
 class ProjectionStatistics(eqx.Module):
-    """Totals over the accepted steps of a solve, and of earlier solves that it continues.
+    """Totals over the accepted steps of a solve, a failed step that ended it, and earlier solves
+    that it continues.
 
     **Attributes:**
 
@@ -30,8 +31,8 @@ class ProjectionStatistics(eqx.Module):
     - `num_iterations`, `max_iterations`: the number of iterations of all, and the largest of one.
     - `residual_before`, `residual_after`, `correction`, `roundoff`: the largest of each, as in a
         `ProjectionInfo`.
-    - `error`: the largest error estimate of the wrapped solver, in the metric of `correction`; NaN
-        if it has none. Corrections that are much longer tell that a quantity is not conserved.
+    - `error`: the largest error estimate of the wrapped solver, in the metric of the projection;
+        NaN if it has none. Corrections that are much longer tell that a quantity is not conserved.
     - `worst`: the position in `names` of the entry of the manifold that failed last; -1 if none
         failed. `print` shows the name.
     - `names`: the names of the entries of the manifold, such as `manifold['energy']`.

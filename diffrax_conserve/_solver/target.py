@@ -13,7 +13,7 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._numerics.metric import AbstractFactor, PreferredSubspace, factor_of
 from .._numerics.problem import Problem, Step, problem_of
-from .._projection.base import AbstractProjection, adapted
+from .._projection.base import AbstractProjection, with_options
 from .._tree import ravel, tree_stop_gradient, unravel
 
 # The solution between two times of the vector field, as a vector.
@@ -21,18 +21,19 @@ Path = Callable[[RealScalarLike], Float[Array, " n"]]
 
 
 class Target(eqx.Module):
-    """Everything that a projection needs except the time and the candidate. Within a step only
-    `rate_integrals` depends on the time, see `add_rates`, so that dense output uses the same
+    """Everything that a projection needs except the time, the candidate and the step. Within a step
+    only `rate_integrals` depends on the time, see `add_rates`, so that dense output uses the same
     target. Times are those of the vector field, and states are vectors.
 
     - `like`: the shapes and dtypes of the state.
     - `values`: the conserved values at the start of the solve.
-    - `cancellation`: as in a `Problem`.
+    - `cancellation`: the part of the scales of the residuals that no gradient shows.
     - `changes`: how far each component moves in the step.
     - `factor`: the factor of the metric where the projection has none of its own: of the metric of
       motion, or with noise of the Euclidean one.
     - `rate_integrals`: in the first row the integrals of the rates since the start of the solve, in
-      the second the compensation, what rounding has added to them; `None` if no entry has a rate.
+      the second Kahan's compensation, which is subtracted from the next increment; `None` if no
+      entry has a rate.
     - `displacements`: how the state has moved within this step and the last one, at a few times, if
       corrections are to stay in their span; see `PreferredSubspace`.
     """
@@ -45,8 +46,8 @@ class Target(eqx.Module):
     args: Args
     changes: Float[Array, " n"]
     factor: AbstractFactor
-    rate_integrals: Float[Array, "2 m"] | None = None
-    displacements: Float[Array, "k n"] | None = None
+    rate_integrals: Float[Array, "2 m"] | None
+    displacements: Float[Array, "k n"] | None
 
     def add_rates(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "Target":
         """The target at a time `end` in a step, given the `path` of the solution from `start`.
@@ -70,8 +71,8 @@ class Target(eqx.Module):
         The rate of a balance may vanish, for example when friction has stopped a pendulum. Its
         integral then keeps an error of roundoff, say an energy of -1e-17, which no state has: all
         later projections would fail. So where the residual at the start of a step is within the
-        tolerance, but more than half of what counts as noise, the conserved value is moved until
-        the residual is half of what counts as noise.
+        tolerance, but larger than half of the noise level, the conserved value is moved until the
+        residual is half of the noise level.
         """
         if self.rate_integrals is None:
             return self
@@ -79,9 +80,10 @@ class Target(eqx.Module):
         residual, jacobian = problem.linearise(y)
         limit = problem.tolerance(problem.scale(jacobian, y))
         within = (self.rate_integrals[0] != 0) & (jnp.abs(residual) <= limit)
-        noise = NOISE / ROUNDOFF * limit / 2
-        follow = jnp.where(within, residual - jnp.clip(residual, -noise, noise), 0)
-        # `add_rates` subtracts the second row from the next integral, which is larger by `follow`.
+        half_noise = NOISE / ROUNDOFF * limit / 2
+        follow = jnp.where(within, residual - jnp.clip(residual, -half_noise, half_noise), 0)
+        # `add_rates` subtracts the second row from the next increment, so that `-follow` there
+        # raises the value by `follow`.
         return dataclasses.replace(self, rate_integrals=self.rate_integrals.at[1].add(-follow))
 
     def problem(
@@ -99,13 +101,13 @@ class Target(eqx.Module):
         step = step if self.projection.sees_step else None
         fields = dict(factor=self.factor, changes=self.changes, step=step)
         problem = problem_of(self.manifold, values, t, self.like, self.args, cancellation, **fields)
-        problem = adapted(problem, self.projection, y)
+        problem = with_options(problem, self.projection, y)
         if self.displacements is None:
             return problem
         factor = PreferredSubspace.spanned_by(problem.factor, self.displacements)
         return dataclasses.replace(problem, factor=factor)
 
     def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:
-        """The factor of the metric of the projection at a state, without the preference."""
+        """The factor of the metric of the projection at a state, without a preferred subspace."""
         own = self.projection.metric
         return self.factor if own is None else factor_of(own, t, unravel(y, self.like), self.args)

@@ -18,7 +18,7 @@ from jax.numpy.linalg import norm
 from jaxtyping import Array, Int, PyTree
 
 from ..._custom_types import Args, RealScalarLike, Y
-from ..._solver.diffrax_private import member, register
+from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import in_field_time, is_backsolve
 from ..._tree import tree_all_finite, tree_shapes
 from .._networks.flow_map import AbstractFlowMap
@@ -127,5 +127,5 @@ def with_result(
         return jnp.where(ended, 0, jnp.where(failed > 0, jnp.inf, e))
 
     failed = jnp.where(ended, refused, failed)
-    result = dfx.RESULTS.where(failed > 0, member(failed), step.result)
+    result = dfx.RESULTS.where(failed > 0, result_at(failed), step.result)
     return StepResult(step.y1, jtu.tree_map(error, step.error), step.coefficients, result)

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
-from ..._solver.diffrax_private import member, register
+from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import in_field_time
 from ..._tree import eps_of, tree_sub
 from .._networks.flat import flatten, working_dtype
@@ -102,7 +102,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
 
         coefficients = series(lambda c: state(start + c * (end - start)), _NODES, end.dtype)
         failed = jnp.where(self._covers(end), 0, _OUTSIDE)
-        result = member(jnp.where(solver_state > 0, solver_state, failed))
+        result = result_at(jnp.where(solver_state > 0, solver_state, failed))
         return state(end), None, dict(coefficients=coefficients), solver_state, result
 
     def _covers(self, time: Array) -> Array:

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
 from ..._options import found_in
-from ..._solver.diffrax_private import member, register
+from ..._solver.diffrax_private import register, result_at
 from .chebyshev import series
 
 _OUTSIDE = register(
@@ -90,7 +90,7 @@ def outcome(
         return step
     if isinstance(policy, _Fail):
         # The error stays finite: a smaller step starts at the same state.
-        result = dfx.RESULTS.where(inside, step.result, member(_OUTSIDE))
+        result = dfx.RESULTS.where(inside, step.result, result_at(_OUTSIDE))
         return StepResult(step.y1, step.error, step.coefficients, result)
 
     def other() -> StepResult:

@@ -22,7 +22,7 @@ from ..._hashable import Hashable
 from ..._numerics.implicit import root
 from ..._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from ..._projection.options import check_state
-from ..._solver.diffrax_private import member, register
+from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
 from .chebyshev import ChebyshevInterpolation, multiply
 from .feature_basis import FeatureBasis, feature_basis
@@ -131,7 +131,7 @@ class RandomFeatureSolver(Hashable, dfx.AbstractSolver[None]):
         # Only the first row changes the end of the step: the other members have a mean of zero.
         y1, known = unravel(start + coefficients[0]), found & jnp.all(jnp.isfinite(errors[0]))
         error = unravel(jnp.where(known, jnp.abs(errors[0]), jnp.inf))
-        result = dfx.RESULTS.where(found, dfx.RESULTS.successful, member(_UNSOLVED))
+        result = dfx.RESULTS.where(found, dfx.RESULTS.successful, result_at(_UNSOLVED))
         return y1, error, dict(coefficients=jax.vmap(unravel)(series)), None, result
 
     def func(self, terms: dfx.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args) -> VF:
