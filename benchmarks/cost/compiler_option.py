@@ -1,9 +1,9 @@
 """The first call of a solve of ten systems, and what an option of XLA's compiler does to it.
 
-Each system is solved by adaptive Tsit5 alone, projected, and projected with XLA's older emitters for
-CPUs, `jax.jit(solve, compiler_options={"xla_cpu_use_fusion_emitters": False})`, which JAX takes for
-the outermost `jit` alone. The first call is the time to trace, to lower and to compile, the least of
-three. Run times are the best of many runs in turns.
+Each system is solved by adaptive Tsit5 alone, projected, and projected with XLA's older emitters
+for CPUs, `jax.jit(solve, compiler_options={"xla_cpu_use_fusion_emitters": False})`, which JAX takes
+for the outermost `jit` alone. The first call is the time to trace, to lower and to compile, the
+least of three. Run times are the best of many runs in turns.
 
 Writes `results/compiler_option.json`.
 """
