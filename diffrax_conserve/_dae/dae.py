@@ -80,6 +80,22 @@ def _mass(mass: Any) -> Any:
     return _Matrix(SparseMatrix(sp.csr_array(mass, dtype=float)))
 
 
+def _product(mass: Any, slopes: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The product with what a function `mass` returns. That of a sparse array is by places, which
+    are found when the equations are searched for them."""
+    if sp.issparse(mass):
+        raise TypeError(
+            "The function `mass` of a `DAE` returns an array of `scipy.sparse`, which JAX cannot "
+            "trace. Return a `jax.experimental.sparse.BCOO` or a matrix, or pass a constant mass "
+            "matrix itself."
+        )
+    if isinstance(mass, BCOO) and mass.n_batch == mass.n_dense == 0:
+        rows, columns = mass.indices.T
+        terms = mass.data.astype(slopes.dtype) * slopes[columns]
+        return jnp.zeros(mass.shape[0], slopes.dtype).at[rows].add(terms)
+    return jnp.asarray(mass, slopes.dtype) @ slopes
+
+
 @final
 class DAE(Hashable):
     r"""A differential-algebraic equation, in one of three forms.
@@ -385,8 +401,9 @@ class DAE(Hashable):
         matrix = self.mass.known if isinstance(self.mass, _Matrix) else None
         if matrix is not None and matrix.shape[0] != size:
             raise ValueError(
-                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers: pass a "
-                "matrix with a row for each equation and a column for each number of the state."
+                f"`mass` has {matrix.shape[0]} rows, but the state has {size} numbers, two for a "
+                "complex one: pass a matrix with a row for each equation and a column for each "
+                "number of the state."
             )
 
         def equations(t: Array, vector: Array, slopes: Array) -> Array:
@@ -401,7 +418,7 @@ class DAE(Hashable):
             if matrix is not None and size >= MIN_KLU:
                 return matrix @ slopes - f
             mass = self.mass(t, state, args) if matrix is None else matrix.matrix.toarray()
-            return jnp.asarray(mass, vector.dtype) @ slopes - f
+            return _product(mass, slopes) - f
 
         return equations
 

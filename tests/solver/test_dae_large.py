@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from jax.experimental.sparse import BCOO
 from scipy.integrate import solve_ivp
 
 import diffrax_conserve as dfc
@@ -261,3 +262,25 @@ def test_a_structure_at_special_numbers_is_not_remembered_for_general_ones(monke
     first.at(y, args=jnp.zeros(4))
     for a, b in zip(slopes(first, jnp.ones(4)), slopes(alone, jnp.ones(4)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_a_function_may_return_a_sparse_mass_matrix():
+    at = np.array([[0, 0], [0, 2], [1, 1]])
+
+    def f(t, y, args):
+        return jnp.array([-y[0], y[2] - y[1], y[0] + y[2] ** 3])
+
+    def entries(y):
+        return jnp.stack([1 + y[0] ** 2, y[1], 2.0])
+
+    def sparse(t, y, args):
+        return BCOO((entries(y), at), shape=(3, 3))
+
+    def dense(t, y, args):
+        return sparse(t, y, args).todense()
+
+    y = jnp.array([0.5, 0.3, -(0.5 ** (1 / 3))])
+    one, other = (jax.jit(dfc.DAE(f, mass=m).term.vf)(0.0, y, None) for m in (sparse, dense))
+    np.testing.assert_allclose(one, other, rtol=1e-14)
+    with pytest.raises(TypeError, match="BCOO"):
+        dfc.DAE(f, mass=lambda t, y, args: sp.eye_array(3)).consistent(y)
