@@ -28,6 +28,12 @@ def by_indices(y):
     return moved[ORDER], y[np.r_[0:3, 7:11]], moved.at[np.array([2, 2, 5])].add(y[:3]), y[::2]
 
 
+def strided(y):
+    """As the two nodes of each cell of a ladder."""
+    a, b = y[0::2], y[1::2]
+    return jnp.stack([a - b[::-1], b], 1).ravel()[1:], b[:-1] - a[1:], y[::3][1:][::2], a[2:4]
+
+
 def chosen(y):
     known = np.arange(N) % 3 == 0
     return (
@@ -48,7 +54,7 @@ def further(y):
     return loop + jax.nn.relu(y), jax.lax.cond(y[0] > 0, jnp.cos, jnp.exp, y), y @ jnp.ones((N, 2))
 
 
-@pytest.mark.parametrize("fn", [pieces, rows, by_indices, chosen, spread, further])
+@pytest.mark.parametrize("fn", [pieces, rows, by_indices, strided, chosen, spread, further])
 def test_values_and_derivatives_are_those_of_the_function(fn):
     y, direction = (jnp.sin(jnp.arange(1.0, N + 1) ** k) for k in (2, 3))
     same = folded(fn, y)

@@ -157,7 +157,7 @@ class _Program:
             shape = [*a.shape]
             shape[axis] += b.shape[axis]
             return self.full(a.number, tuple(shape), a.dtype)
-        if a.what[0] == b.what[0] == "slice" and a.row == b.row:
+        if a.what[0] == b.what[0] == "part" and a.row == b.row:
             (_, starts, limits), (_, next_starts, next_limits) = a.what, b.what
             others = [k for k in range(len(starts)) if k != axis]
             same = all((starts[k], limits[k]) == (next_starts[k], next_limits[k]) for k in others)
@@ -174,7 +174,7 @@ class _Program:
             return self.full(x.number, shape, x.dtype)
         if x.known is not None:
             return self.constant(x.known[tuple(map(slice, starts, limits))])
-        if x.what[0] == "slice":
+        if x.what[0] == "part":
             first = x.what[1]
             moved = ([a + b for a, b in zip(first, ends, strict=True)] for ends in (starts, limits))
             return self.sliced(x.row[0], *moved)
@@ -188,7 +188,7 @@ class _Program:
                     parts.append(self.sliced(j, low, high))
             return self.concatenated(parts, axis)
         fn = lambda x: lax.slice(x, starts, limits)  # noqa: E731
-        return self.operation(("slice", starts, limits), shape, x.dtype, fn, (i,))
+        return self.operation(("part", starts, limits), shape, x.dtype, fn, (i,))
 
     def piece(self, i: int, start: int, limit: int) -> int:
         """A piece of a vector; a scalar is one in all places."""
