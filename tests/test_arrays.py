@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from diffrax_conserve._fast.arrays import folded
 from diffrax_conserve._fast.jaxprs import num_equations
@@ -123,3 +125,32 @@ def test_numbers_that_are_none():
     assert np.isnan(none).all()
     assert np.isposinf(infinite).all()
     assert not zeros.any()
+
+
+# Of a vector a vector.
+OPERATIONS = (
+    *(lambda x: x[::2], lambda x: x[1::3], lambda x: x[::-1], lambda x: x[1:]),
+    *(lambda x: jnp.roll(x, 2), jnp.cumsum, lambda x: jnp.pad(x, (1, 2)), lambda x: jnp.tile(x, 2)),
+    *(lambda x: jnp.repeat(x, 2), lambda x: x * jnp.arange(1.0, x.size + 1), jnp.sort),
+    *(lambda x: jnp.concatenate([x, jnp.zeros(3), x[:1]]), lambda x: jnp.hstack([x[0], x])),
+    *(lambda x: x.at[::2].set(0.0), lambda x: x.at[1:].add(x[:-1]), lambda x: jnp.sin(x) * 0.0),
+    *(lambda x: jnp.stack([x, -x]).ravel(), lambda x: jnp.stack([x, 0 * x], 1).ravel()),
+    *(lambda x: jnp.outer(x, x[:2]).sum(1), lambda x: x[np.array([0, -1, x.size // 2])]),
+    *(lambda x: jnp.where(np.arange(x.size) % 2, x, 0.0), lambda x: jnp.convolve(x, jnp.ones(3))),
+    *(lambda x: jnp.split(x, [x.size // 2])[1], lambda x: jax.lax.pad(x, 0.0, ((0, 0, 1),))),
+    *(lambda x: jax.lax.scan(lambda c, v: (c + v, c * v), 0.0, x)[1], lambda x: x / (1 + x**2)),
+)
+
+
+@pytest.mark.slow
+@settings(max_examples=40)
+@given(st.lists(st.integers(0, len(OPERATIONS) - 1), min_size=2, max_size=6))
+def test_any_sequence_of_operations(sequence):
+    def fn(y):
+        for k in sequence:
+            y = OPERATIONS[k](y)[:30]
+        return y
+
+    y = jnp.sin(jnp.arange(1.0, N + 1) ** 2)
+    for f, g in ((folded(fn, y), fn), (jax.jacfwd(folded(fn, y)), jax.jacfwd(fn))):
+        np.testing.assert_allclose(f(y), g(y), rtol=1e-12, atol=1e-12)
