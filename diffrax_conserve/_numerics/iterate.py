@@ -1,8 +1,9 @@
 """The iterations that lead to the manifold: one loop, and the steps that it can make.
 
 All are Newton's method, for at least as many unknowns as equations. They differ in their steps, so
-a step is a function of the unknowns and of a counter, and the loop around it is written once, in
-`iterate`. In this file a step is one of an iteration, unless it is called a step of the solver.
+a step is a function of the unknowns and of the number of tests that are left, and the loop around
+it is written once, in `iterate`. In this file a step is one of an iteration, unless it is called a
+step of the solver.
 
 - `simplified_newton` is for candidates as near as the local error of a solver's step (Hairer,
   Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
@@ -50,7 +51,7 @@ from .problem import (
 )
 from .rows import AbstractRows, DenseRows
 
-# A step of an iteration: the unknowns and the counter after it.
+# A step of an iteration: from the unknowns and `tests_left` to both after it.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
