@@ -15,9 +15,10 @@ from scipy.integrate import solve_ivp
 import diffrax_conserve as dfc
 from diffrax_conserve._dae import dae as dae_module
 from diffrax_conserve._dae import search, stage_systems
+from diffrax_conserve._large.klu import why_not
 
-pytest.importorskip("asdex")
-pytest.importorskip("klujax")
+if why_not():
+    pytest.skip(why_not(), allow_module_level=True)
 
 
 # ---- Equations, each made anew, so that nothing that was found or compiled is shared ----
