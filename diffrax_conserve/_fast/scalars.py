@@ -118,7 +118,7 @@ def written(
 
 
 def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
-    """`run(given, lanes)` as a function of `given`, where `lanes` tells whether it is batched.
+    """`run(given, is_batched)` as a function of `given`.
 
     Both forms are jitted, so that JAX traces each once, although it batches the loop over the steps
     of a solve several times. The results of `run` are arrays.
@@ -126,7 +126,10 @@ def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
 
     def call(given: Any) -> Any:
         arrays, static = eqx.partition(given, eqx.is_array)
-        form = lambda lanes: jax.jit(lambda arrays: run(eqx.combine(arrays, static), lanes))  # noqa: E731
+
+        def form(is_batched: bool) -> Callable[[Any], Any]:
+            return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
+
         alone, lane = jax.custom_batching.custom_vmap(form(False)), form(True)
 
         @alone.def_vmap
