@@ -2,14 +2,18 @@
 
 For each problem and method: accepted and rejected steps, of CVODE evaluations of the field, the
 error at the end, and where it fails, the time. Tolerances 1e-4 relative and 1e-8 absolute; of the
-last problem 1e-1 and 1e-2.
+last problem 1e-1 and 1e-2. Then what bounds cost where no solution becomes negative: the time of a
+solve over that of the plain one, and the error at the end.
 
 Run: `python benchmarks/cost/reject.py` (a minute).
 """
 
+import functools as ft
+
 import diffrax
 import jax
 import jax.numpy as jnp
+import measuring
 import numpy as np
 from sksundae.cvode import CVODE
 
@@ -53,6 +57,54 @@ PROBLEMS = {
     ),
     "reactions": (reactions, [1.0, 0, 0], 0.5, three(0.5), total, diffrax.Bosh3(), 1e-1, 1e-2),
 }
+
+
+def epidemic(t, y, args):
+    infected, recovered = 0.5 * y[0] * y[1], 0.1 * y[1]
+    return jnp.stack([-infected, infected - recovered, recovered])
+
+
+def robertson(t, y, args):
+    first, second, third = 0.04 * y[0], 1e4 * y[1] * y[2], 3e7 * y[1] ** 2
+    return jnp.stack([second - first, first - second - third, third])
+
+
+# Solutions that stay positive without a bound: the field, the start, the end, and the solver.
+POSITIVE = {
+    "epidemic": (epidemic, [0.99, 0.01, 0.0], 100.0, diffrax.Tsit5()),
+    "Robertson": (robertson, [1.0, 0.0, 0.0], 1e4, diffrax.Kvaerno5()),
+}
+
+
+def costs_of_bounds():
+    within = dfc.SimplifiedNewton(lower=0.0)
+    for name, (field, y0, t1, solver) in POSITIVE.items():
+        methods = {
+            "plain": solver,
+            "bounds alone": dfc.ManifoldProjection(solver, (), projection=within),
+            "total": dfc.ManifoldProjection(solver, total),
+            "bounds and total": dfc.ManifoldProjection(solver, total, projection=within),
+        }
+
+        def end(solver, y0, tolerance, field=field, t1=t1):
+            return diffrax.diffeqsolve(
+                diffrax.ODETerm(field), solver, 0.0, t1, 1e-6, y0, max_steps=100_000,
+                stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance / 1e3),
+            ).ys[-1]  # fmt: skip
+
+        y0 = jnp.array(y0)
+        exact = end(solver, y0, 1e-11)
+        runs = {
+            method: ft.partial(jax.jit(ft.partial(end, chosen, tolerance=1e-6)), y0)
+            for method, chosen in methods.items()
+        }
+        for run in runs.values():
+            run()
+        measured = measuring.take_turns(runs, 10)
+        plain = measured["plain"].seconds
+        for method, (seconds, answer) in measured.items():
+            error = jnp.max(jnp.abs(answer - exact))
+            print(f"{name}: {method}: {seconds / plain:.2f} times plain, error {error:.0e}")
 
 
 def by_cvode(field, y0, t1, exact, rtol, atol, **bounds):
@@ -103,6 +155,7 @@ def main():
             ("clipped, projected", clipped, projected),
         ]:
             print(f"{name}: {method}: {by_diffrax(right_side, *problem, chosen)}", flush=True)
+    costs_of_bounds()
 
 
 if __name__ == "__main__":
