@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from ._manifold import evaluate, exactly, is_entry, named_entries, rate_of
+from ._manifold import at_full_precision, evaluate, is_entry, named_entries
 
 # Gauss quadrature with four nodes is exact for polynomials of degree seven, so its error in a step
 # is of order nine, like that of the most accurate solver in diffrax, Dopri8.
@@ -22,13 +22,13 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 
 
 def has_rates(manifold: Manifold) -> bool:
-    return any(rate_of(entry) is not None for _, entry in named_entries(manifold))
+    return any(entry.rate is not None for _, entry in named_entries(manifold))
 
 
 def refuse_rates(manifold: Manifold, user: str) -> None:
     """Raises if an entry has a rate, because `user` does not integrate rates."""
     for name, entry in named_entries(manifold):
-        if rate_of(entry) is not None:
+        if entry.rate is not None:
             raise ValueError(
                 f"`{name}` is a balance law, a `FirstIntegral` with a `rate`, but {user} keeps "
                 "values that do not change. Leave it to a `ManifoldProjection`."
@@ -40,10 +40,12 @@ def rates(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     that has none is zero."""
 
     def rate(entry: Any, like: Any) -> Values:
-        fn = rate_of(entry)
+        fn = entry.rate
         if fn is None:
             return jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-        return jtu.tree_map(lambda r, x: jnp.asarray(r, x.dtype), exactly(fn, t, y, args), like)
+        return jtu.tree_map(
+            lambda r, x: jnp.asarray(r, x.dtype), at_full_precision(fn, t, y, args), like
+        )
 
     values = jax.eval_shape(lambda: evaluate(manifold, t, y, args))
     return jtu.tree_map(rate, manifold, values, is_leaf=is_entry)

@@ -1,4 +1,4 @@
-"""The numbers of the core, each with its reason. What follows from one of them is computed."""
+"""The numbers of the core, each with its reason."""
 
 # A residual of at most this many units of roundoff of its scale counts as zero. Rounding the state
 # and evaluating the residual contribute about one unit each, in long sums a few. The promise "16
@@ -33,9 +33,9 @@ MAX_UNROLLED = 4
 # five projections on the seven integrals of an orbit, of which five are independent, does not
 # converge.
 REGULARISATION_POWER = 3 / 4
-# So many steps of iterative refinement remove from a solution what the addition has changed in it.
+# The number of steps of iterative refinement that remove the effect of this shift.
 NUM_REFINEMENTS = 2
-# Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
+# The derivative of `clip` beyond the bounds; within them it is one. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 SLOPE_BEYOND_BOUNDS = 1e-10
 # Up to this many unknowns and constraints together a dense system is solved in each step: that of

@@ -31,15 +31,15 @@ from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
 
 @final
 class AsArrays(eqx.Module):
-    """A `Target`, or another module, in the form in which `dense_info` can store it. diffrax copies
+    """A module, such as a `Target`, in the form in which `dense_info` can store it. diffrax copies
     the leaves of `dense_info` into arrays over the steps, so that only arrays may be leaves."""
 
     arrays: PyTree[Array]
     static: Any = eqx.field(static=True)
 
-    def __init__(self, target: Any):
+    def __init__(self, module: Any):
         # Python numbers stay what they are, because a function may use them as a shape or an index.
-        arrays, self.static = eqx.partition(target, lambda x: isinstance(x, jax.Array | np.ndarray))
+        arrays, self.static = eqx.partition(module, lambda x: isinstance(x, jax.Array | np.ndarray))
         self.arrays = jtu.tree_map(jnp.asarray, arrays)
 
     def unpack(self) -> Any:
@@ -68,7 +68,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     - `step_norm`: the norm of the step in the metric. A correction may be as long as it, or as the
       distance of the moved interpolant from the start of the step.
     - `error`: the error estimate of the step, if the projection uses it.
-    - `target`: what the projection of the step aimed at, without the balances of the step itself.
+    - `target`: what the projection of the step aimed at, without the integrals of the rates over
+      this step.
     """
 
     t0: RealScalarLike  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -87,19 +88,19 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         if t1 is not None:
             return tree_sub(self.evaluate(t1, left=left), self.evaluate(t0, left=left))
         # A time exactly at an end is inside, so that the slope there is that of the interpolant.
-        y_start, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
-        t = jnp.where(t0 < y_start, y_start, jnp.where(t0 > last, last, t0))
+        first, last = jnp.minimum(self.t0, self.t1), jnp.maximum(self.t0, self.t1)
+        t = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         u = self.inner.evaluate(t, left=left)
-        share = (t - self.t0) / nonzero_length(self.t0, self.t1)
-        moved = ravel(u) + share.astype(self.step_correction.dtype) * self.step_correction
+        theta = (t - self.t0) / nonzero_length(self.t0, self.t1)
+        moved = ravel(u) + theta.astype(self.step_correction.dtype) * self.step_correction
         return unravel(self.projected(self.field_time(t), moved), u)
 
     def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
-        start, end = self.field_time(self.t0), self.field_time(self.t1)
+        t_start, t_end = self.field_time(self.t0), self.field_time(self.t1)
         path = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
-        target, y_start = self.target.unpack().add_rates(start, t, path), path(start)
-        step = Step(start, end, y_start, self.error)
+        target, y_start = self.target.unpack().add_rates(t_start, t, path), path(t_start)
+        step = Step(t_start, t_end, y_start, self.error)
         problem = target.problem(t, candidate, step)
         metric, projection = problem.factor, target.projection
         distance = metric.norm(candidate - y_start)
@@ -115,15 +116,13 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         # A second attempt would lose the bounds.
         if not projection.follows_gradients or projection.has_bounds:
             return y
-        primal_problem, start = tree_stop_gradient((problem, candidate))
+        primal_problem, primal_candidate = tree_stop_gradient((problem, candidate))
 
         def second_attempt() -> tuple[Array, Array]:
-            found = damped_newton(primal_problem, start, max_steps=projection.max_steps)
+            found = damped_newton(primal_problem, primal_candidate, max_steps=projection.max_steps)
             return found.y, is_accepted(found.y, found.ok)
 
-        # A condition that is the same for all lanes of a batch remains a branch, which is skipped
-        # if no lane needs it.
-        found, better = lax.cond(any_lane(~ok), second_attempt, lambda: (start, ok))
+        found, better = lax.cond(any_lane(~ok), second_attempt, lambda: (primal_candidate, ok))
         # The derivative of the second attempt is that of the interpolant.
         zero = y - lax.stop_gradient(y)  # zero, but with a derivative
         return lax.stop_gradient(jnp.where(better & ~ok, found, y)) + zero

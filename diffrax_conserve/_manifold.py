@@ -81,6 +81,8 @@ class Constraint(Hashable):
     """
 
     fn: ConstraintFn
+    # No field: its function stays zero.
+    rate = None
 
     def __check_init__(self):
         check_function("`fn` of a `Constraint`", self.fn, "fn(t, y, args)", "real arrays")
@@ -172,10 +174,6 @@ def has_value(entry: Any) -> bool:
     return isinstance(entry, Constraint) or entry.value is not None
 
 
-def rate_of(entry: Any) -> ConstraintFn | None:
-    return entry.rate if isinstance(entry, FirstIntegral) else None
-
-
 def check_manifold(manifold: Manifold) -> None:
     entries = named_entries(manifold)
     if not entries:
@@ -199,13 +197,17 @@ def named_entries(manifold: Manifold, root: str = "manifold") -> list[tuple[str,
     return [(f"{root}{jtu.keystr(path)}", entry) for path, entry in flat]
 
 
+def entry_names(manifold: Manifold) -> tuple[str, ...]:
+    return tuple(name for name, _ in named_entries(manifold))
+
+
 def evaluate(manifold: Manifold, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`manifold` with each entry replaced by `fn(t, y, args)`."""
-    value = lambda entry: jtu.tree_map(jnp.asarray, exactly(entry.fn, t, y, args))  # noqa: E731
+    value = lambda entry: jtu.tree_map(jnp.asarray, at_full_precision(entry.fn, t, y, args))  # noqa: E731
     return jtu.tree_map(value, manifold, is_leaf=is_entry)
 
 
-def exactly(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:
+def at_full_precision(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> Values:
     """`fn(t, y, args)`, with matrix products of full precision. By default a GPU multiplies
     matrices in float32 with inputs of three digits (TensorFloat-32), which no tolerance could allow
     for."""
@@ -245,7 +247,7 @@ def conserved_values(
     found = []
     for (name, entry), value in zip(entries, values, strict=True):
         with calling_fn(name, t, y, args):
-            output = exactly(entry.fn, t, y, args)
+            output = at_full_precision(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
             if value is not None:
@@ -275,7 +277,7 @@ def _check_output(
                 f"returned {leaf!r}. Convert it, for example by `jnp.asarray(..., dtype=float)`, "
                 "or split a complex value into its real and its imaginary part."
             )
-    if rate_of(entry) is not None:
+    if entry.rate is not None:
         with calling(f"`rate` of `{name}`", "rate(t, y, args)", t, y, args):
             rates = eqx.filter_eval_shape(entry.rate, t, y, args)
         _check_shapes(f"`rate` of `{name}` returns", rates, output)

@@ -56,7 +56,8 @@ def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
 
 
 def eps_of(x: Any) -> float:
-    """The unit of roundoff of an array, or of a dtype."""
+    """The machine epsilon of an array or a dtype, the spacing of floats at one. "Units of roundoff"
+    are multiples of it here, although the largest relative error of rounding is half of it."""
     return float(jnp.finfo(jnp.result_type(x)).eps)
 
 

@@ -233,7 +233,7 @@ def cross_kinks_in_full_steps(package):
 
 def differentiate_at_constant_unknowns(package):
     constant = lambda self, solved: lax.stop_gradient(solved.y)  # noqa: E731
-    package.replace("SquareSystem.unknowns", constant)
+    package.replace("SquareSystem.linearisation_point", constant)
 
 
 def never_give_up(package):

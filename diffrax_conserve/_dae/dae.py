@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .._constants import MIN_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
-from .._fast.run_once import run_once
+from .._fast.run_once import RunOnce
 from .._hashable import Hashable
 from .._manifold import Constraint, named_entries, slope_like
 from .._numerics.implicit import root
@@ -314,7 +314,7 @@ class DAE(Hashable):
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
         times = structure.times
-        off = run_once(eqx.filter_jit)(_Constraints(self))(t, y, args)[: structure.index]
+        off = RunOnce(eqx.filter_jit, _Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
             differentiated={equations[i]: n for i, n in enumerate(times) if n},
@@ -660,7 +660,7 @@ class ConstraintProjection(AbstractProjection):
         return y, problem.report(candidate, y, converged=converged)
 
 
-@run_once(eqx.filter_jit)
+@ft.partial(RunOnce, eqx.filter_jit)
 def _consistent(
     dae: DAE, t: Array, y: Y, args: Args, moves: Bool[np.ndarray, " n"] | None
 ) -> tuple[Y, Bool[Array, ""]]:

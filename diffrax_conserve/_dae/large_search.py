@@ -22,7 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array
 
-from .._fast.run_once import run_once
+from .._fast.run_once import RunOnce
 from .._large.asdex_import import asdex
 from .._large.elimination import TooFull, combinations, extended
 from .._large.klu import SparseJacobian
@@ -355,14 +355,14 @@ class _Last:
         return _last_values(self, places, numbers, t, y)
 
 
-@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
 def _last_values(
     last: _Last, places: SparseJacobian, numbers: Numbers, t: Array, y: Array
 ) -> Array:
     return places.values(lambda y: last.constraints(numbers, t, y, y), y)
 
 
-@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
 def _by_slope(
     equations: WithNumbers,
     places: SparseJacobian,
@@ -374,7 +374,7 @@ def _by_slope(
     return places.values(lambda slopes: equations(numbers, t, y, slopes), slopes)
 
 
-@run_once(ft.partial(jax.jit, static_argnums=(0, 1, 2)))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1, 2)))
 def _near(
     equations: WithNumbers,
     by_y: SparseJacobian,

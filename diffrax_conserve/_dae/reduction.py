@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._constants import REGULARISATION_POWER
 from .._fast.arrays import folded
-from .._fast.run_once import run_once
+from .._fast.run_once import RunOnce
 from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._tree import eps_of, irregular_weights
@@ -376,12 +376,12 @@ def find_structure(
 # What a search evaluates is compiled once for the equations, and then serves all numbers.
 
 
-@run_once(ft.partial(jax.jit, static_argnums=0))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))
 def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
     return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
 
 
-@run_once(ft.partial(jax.jit, static_argnums=(0, 1)))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
 def _last_gradients(
     equations: WithNumbers, structure: Structure, numbers: Numbers, t: Array, y: Array
 ) -> Array:
@@ -389,7 +389,7 @@ def _last_gradients(
     return jax.jacfwd(lambda y: constraints(t, y)[-1])(y)
 
 
-@run_once(ft.partial(jax.jit, static_argnums=0))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))
 def _near(
     equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float
 ) -> tuple[Array, ...]:

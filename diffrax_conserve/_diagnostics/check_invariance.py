@@ -27,7 +27,6 @@ from .._manifold import (
     evaluate,
     is_entry,
     named_entries,
-    rate_of,
     slope_of,
 )
 from .._numerics.problem import problem_of, relative_to_scale
@@ -294,7 +293,7 @@ def _entry_of_report(name: str, entry: Entry, rtol: float, *found: np.ndarray) -
             f"{residuals[worst]:.1e}). Give states on the manifold, such as `dfc.project(manifold, "
             "y)[0]`, or make it a `FirstIntegral` if it is conserved at any value."
         )
-    kind = "first integral" if rate_of(entry) is None else "balance"
+    kind = "first integral" if entry.rate is None else "balance"
     kind = "constraint" if isinstance(entry, Constraint) else kind
     defect, is_constant = float(defects[state]), bool(np.all(constant))
     is_tested = not np.any(np.all(idle, axis=0))

@@ -21,11 +21,6 @@ class RunOnce:
         return (self._quick if _knows_options() else self.inside)(*args)
 
 
-def run_once(jit: Callable[..., Any]) -> Callable[[Callable[..., Any]], RunOnce]:
-    """`RunOnce` as a decorator."""
-    return ft.partial(RunOnce, jit)
-
-
 @ft.cache
 def _knows_options() -> bool:
     if jax.default_backend() != "cpu":

@@ -74,10 +74,7 @@ class Pattern:
         (self.size, self.num_columns), self.dense_rows = shape, np.flatnonzero(dense)
         self.klu = klu
         self.colours, of_dense, (rows, columns, colour) = _coloured(shape, found, dense)
-        self.sparse_colours, self.dense_colours = (
-            np.flatnonzero(~of_dense),
-            np.flatnonzero(of_dense),
-        )
+        self.sparse_colours, self.dense_colours = map(np.flatnonzero, (~of_dense, of_dense))
         colour = np.searchsorted(self.sparse_colours, colour)
         self.active = slice(int(columns.min()), int(columns.max()) + 1)
         width = self.active.stop - self.active.start

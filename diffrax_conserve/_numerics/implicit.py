@@ -33,8 +33,9 @@ class AbstractSystem(eqx.Module):
         """The unknowns that solve the equations, as far as the iteration gets."""
 
     @abc.abstractmethod
-    def unknowns(self, solved: Solved) -> Any:
-        """All unknowns `x`, of which an iteration may return only some."""
+    def linearisation_point(self, solved: Solved) -> Any:
+        """The unknowns `x` at which `F` is linearised. An iteration may return others, such as the
+        state in the place of the multipliers."""
 
     @abc.abstractmethod
     def equations(self, unknowns: Any) -> Any:
@@ -42,7 +43,7 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
-        """`-(∂F/∂x)⁻¹ t_equations`, of which the unknowns that the iteration returns."""
+        """The tangent of what the iteration returns: that of `x` is `-(∂F/∂x)⁻¹ t_equations`."""
 
 
 @eqx.filter_custom_jvp
@@ -55,7 +56,7 @@ def implicit_solution(system: AbstractSystem) -> Solved:
 def _solution_jvp(primals: Any, tangents: Any) -> Any:
     (system,), (t_system,) = primals, tangents
     solved = implicit_solution(system)
-    x = system.unknowns(solved)
+    x = system.linearisation_point(solved)
     values, t_values = eqx.filter_jvp(lambda system: system.equations(x), (system,), (t_system,))
     tangent = system.solve_linearised(solved, tree_tangents(values, t_values))
     none = jtu.tree_map(lambda _: None, solved)
@@ -67,9 +68,8 @@ class MultiplierSystem(AbstractSystem):
     """The projection along directions: the state `y = ŷ + S Uᵀ λ` with `g(y) = 0`, where the rows
     of `U` are the `directions`, or the gradients at the candidate `ŷ`.
 
-    The equations are `y = ŷ + S Uᵀ λ` and `g(y) = 0`. The first gives the state, so that the only
-    unknowns are the multipliers `λ`. But what is wanted is the derivative of the state. So
-    `equations` returns two expressions, the state `ŷ + S Uᵀ λ`, and `g` there.
+    The unknowns are the multipliers `λ`, but the iteration returns the state, whose tangent is
+    wanted. So `equations` returns the state `ŷ + S Uᵀ λ` beside `g` there.
 
     Where the gradients of constraints are nearly parallel, as on an almost circular orbit, a
     derivative would divide the error of the candidate's derivative by the sine of their angle. In
@@ -111,13 +111,13 @@ class MultiplierSystem(AbstractSystem):
             return self.directions
         return self.problem.gradients(start)
 
-    def unknowns(self, solved: Solved) -> tuple[Array, Array]:
+    def linearisation_point(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
         row_norms, rows = self._directions_at(start).unit()
         change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
-        return solved.ok, rows.best_multiplier(change) / row_norms
+        return solved.ok, rows.least_squares_multiplier(change) / row_norms
 
     def equations(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
@@ -175,7 +175,7 @@ class SquareSystem(AbstractSystem):
     def solved(self) -> Solved:
         return self.iterate(self.guess)
 
-    def unknowns(self, solved: Solved) -> Any:
+    def linearisation_point(self, solved: Solved) -> Any:
         return solved.y
 
     def equations(self, unknowns: Any) -> Any:

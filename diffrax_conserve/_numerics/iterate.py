@@ -40,7 +40,7 @@ from .._constants import (
     SLOPE_BEYOND_BOUNDS,
 )
 from .._fast.scalars import joined, loop_in_scalars, with_batch_flag
-from .linear import permuted, pivot_order, roundoff_pivot_tolerance
+from .linear import forward_elimination, permuted, roundoff_pivot_tolerance
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -73,15 +73,6 @@ class Solved(NamedTuple):
 # ---- The loop ----
 
 
-class _LoopState(NamedTuple):
-    """What the loop carries. It carries little, because for small systems moving the carry costs
-    more than the arithmetic."""
-
-    y: Any
-    tests_left: Array
-    num_iterations: Array
-
-
 def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
     """Advances the unknowns until no test is left.
 
@@ -93,13 +84,14 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
     are done, for which no test is left, as they are.
     """
 
-    def body(now: _LoopState) -> _LoopState:
-        y, tests_left = advance(now.y, now.tests_left)
-        return _LoopState(y, tests_left, now.num_iterations + (tests_left > 0).astype(int))
+    def body(now: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
+        y, tests_left = advance(*now[:2])
+        return y, tests_left, now[2] + (tests_left > 0).astype(int)
 
-    start = _LoopState(y, initial_tests(max_steps), jnp.asarray(0))
-    end = lax.while_loop(lambda now: any_lane(now.tests_left > 0), body, start)
-    return Solved(end.y, end.tests_left == 0, end.num_iterations)
+    # The carry is small, because for small systems moving it costs more than the arithmetic.
+    begin = y, initial_tests(max_steps), jnp.asarray(0)
+    y, tests_left, count = lax.while_loop(lambda now: any_lane(now[1] > 0), body, begin)
+    return Solved(y, tests_left == 0, count)
 
 
 def initial_tests(max_steps: int) -> Int[Array, ""]:
@@ -187,7 +179,8 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         directions, or the gradients at the candidate."""
         rows = problem.gradients(y).scaled()[1]
         fixed = rows if directions is None else directions
-        order = pivot_order(rows.gram(fixed).matrix)
+        gram = rows.gram(fixed).matrix
+        order = forward_elimination(gram, gram[0], gram)[2]
         return order, permuted(order, fixed.matrix)
 
     def advance(invariants: Any, y: Any, tests_left: Array) -> tuple[Any, Array]:

@@ -110,11 +110,6 @@ def forward_elimination(
     return jnp.stack(reduced_rows), jnp.stack(right), tuple(order)
 
 
-def pivot_order(gram: Float[Array, "m m"]) -> PivotOrder:
-    """The order in which the elimination takes the constraints, whatever the right side is."""
-    return forward_elimination(gram, gram[0], gram)[2]
-
-
 def permuted(order: PivotOrder, each: Array) -> Array:
     """One element or row for each constraint, in this order."""
     if not order:

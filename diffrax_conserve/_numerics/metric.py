@@ -139,9 +139,9 @@ class PreferredSubspace(AbstractFactor):
     `P = Qᵀ Q` projects onto the span of the orthonormal rows of `basis`, as measured by `S`.
 
     In this metric a correction leaves the span only where none within it reaches the manifold,
-    because lengths outside of the span are multiplied by `1/δ`. The Gram matrix of the span alone
-    may be singular. So `δ²`, the weight in `M⁻¹` of the complement, is the power of roundoff that
-    is added to the diagonal of a large Gram matrix too.
+    because lengths outside of the span are multiplied by `1/δ`. The weight of the complement in
+    `M⁻¹`, `δ²`, is the shift that a large Gram matrix gets on its diagonal, because the Gram matrix
+    of the span alone may be singular.
     """
 
     base_factor: AbstractFactor
@@ -160,7 +160,7 @@ class PreferredSubspace(AbstractFactor):
         changes = jax.vmap(base_factor.to_metric)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
-        least = _COMPLEMENT_DAMPING(changes.dtype) ** 2
+        least = _complement_damping(changes.dtype) ** 2
 
         def add(basis: Array, k: Array) -> tuple[Array, None]:
             new = changes[k]
@@ -175,17 +175,17 @@ class PreferredSubspace(AbstractFactor):
 
     def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         return self._damped_complement(
-            self.base_factor.scale_gradient(gradient), _COMPLEMENT_DAMPING(gradient.dtype)
+            self.base_factor.scale_gradient(gradient), _complement_damping(gradient.dtype)
         )
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.base_factor.to_state(
-            self._damped_complement(change, _COMPLEMENT_DAMPING(change.dtype))
+            self._damped_complement(change, _complement_damping(change.dtype))
         )
 
     def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return self._damped_complement(
-            self.base_factor.to_metric(change), 1 / _COMPLEMENT_DAMPING(change.dtype)
+            self.base_factor.to_metric(change), 1 / _complement_damping(change.dtype)
         )
 
     def norm(self, change: Float[Array, " n"]) -> Float[Array, ""]:
@@ -195,11 +195,11 @@ class PreferredSubspace(AbstractFactor):
     def _damped_complement(self, x: Float[Array, "*m n"], outside: float) -> Float[Array, "*m n"]:
         """`x (P + outside (1 - P))`."""
         product = ft.partial(jnp.matmul, precision=lax.Precision.HIGHEST)
-        within = product(product(x, self.basis.T), self.basis)
-        return within + outside * (x - within)
+        projected = product(product(x, self.basis.T), self.basis)
+        return projected + outside * (x - projected)
 
 
-def _COMPLEMENT_DAMPING(dtype: Any) -> float:
+def _complement_damping(dtype: Any) -> float:
     """`δ` of `PreferredSubspace`."""
     return eps_of(dtype) ** (REGULARISATION_POWER / 2)
 

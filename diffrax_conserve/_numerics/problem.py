@@ -4,12 +4,12 @@ For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` is its fun
 
 A residual in floating-point arithmetic is never exactly zero, so this file also says when it counts
 as zero. The roundoff of a residual is proportional to the size of the terms that cancel in it, its
-*scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order this is what relative errors of `ε` in `I₀` and
-in each component of the state change, divided by `ε`. Terms that cancel inside a function and leave
-no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum. The file `roundoff`
-measures them, and they are added as the *cancellation* of the scale. A component that has changed
-by `c_k` in a step of the solver is known to roundoff of `c_k` only, which matters where it vanishes
-itself, as on `q[0] = 0`. So in a step of the solver its size counts as `|y_k| + c_k`.
+*scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the change of the residual by relative
+errors of `ε` in `I₀` and in each component of the state, divided by `ε`. Terms that cancel inside a
+function and leave no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum.
+The file `roundoff` measures them, and they are added as the *cancellation* of the scale. A
+component that has changed by `c_k` in a step of the solver is known to roundoff of `c_k` only,
+which matters where it vanishes, as on `q[0] = 0`. So its size counts as `|y_k| + c_k` in a step.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
-from .._manifold import evaluate, is_entry, named_entries
+from .._manifold import entry_names, evaluate, is_entry
 from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
@@ -126,15 +126,15 @@ class Problem(eqx.Module):
         """
         if self.pattern is not None and not self.factor.is_dense:
             return SparseRows.linearised(self.pattern, self.functions, y)
-        values, rows = [], []
+        residuals, rows = [], []
         for part in self.functions:
             value, vjp = jax.vjp(part, y)
-            values.append(value)
+            residuals.append(value)
             if value.size == 1:
                 rows.append(vjp(jnp.ones_like(value))[0][None])
             else:
                 rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
-        return jnp.concatenate(values), DenseRows(jnp.concatenate(rows))
+        return jnp.concatenate(residuals), DenseRows(jnp.concatenate(rows))
 
     def gradients(self, y: Float[Array, " n"]) -> AbstractRows:
         """`G(y) S`, the gradients in the coordinates in which the metric is Euclidean."""
@@ -162,9 +162,8 @@ class Problem(eqx.Module):
         and the residuals that are to be corrected, with zeros for those that are noise."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
-        # Where a tolerance underflows, the residual does so too, and nothing exceeds an infinite
-        # one. Either would accept any state, so it counts as not met. If the scale is exactly zero,
-        # all terms are zero, and so is the residual.
+        # A tolerance that underflows or is infinite would accept any state, so it counts as not
+        # met. If the scale is exactly zero, so is the residual.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         met_tolerance = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be
@@ -207,19 +206,17 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        if ok is None:
-            success = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
-        else:
-            success = ok
+        is_met = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
+        success = is_met if ok is None else ok
         before, after = (jnp.max(x) for x in sizes)
-        kinds = optx.RESULTS
-        missed, diverged = kinds.nonlinear_max_steps_reached, kinds.nonlinear_divergence
-        failed = kinds.where(jnp.isfinite(after), missed, diverged)
-        failed = kinds.where(jnp.isfinite(before), failed, kinds.nonfinite)
+        results = optx.RESULTS
+        missed, diverged = results.nonlinear_max_steps_reached, results.nonlinear_divergence
+        failed = results.where(jnp.isfinite(after), missed, diverged)
+        failed = results.where(jnp.isfinite(before), failed, results.nonfinite)
         entry = jnp.asarray(self.per_residual(range(len(self.functions))))
         return ProjectionInfo(
             ok=success,
-            result=kinds.where(success, kinds.successful, failed),
+            result=results.where(success, results.successful, failed),
             num_iterations=jnp.asarray(num_iterations),
             residual_before=before,
             residual_after=after,
@@ -303,7 +300,7 @@ def problem_of(
         args=args,
         values=unflatten(values, shapes),
         like=like,
-        names=tuple(name for name, _ in named_entries(manifold)),
+        names=entry_names(manifold),
         keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
         functions=tuple(residuals),
         sizes=tuple(sizes),

@@ -90,7 +90,7 @@ def cancellation_scale(
         ]
         cancellation = jnp.concatenate(measured)
     shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
-    return value, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
+    return shown, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
 
 
 def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:

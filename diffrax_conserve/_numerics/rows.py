@@ -7,14 +7,14 @@ Gram matrices are singular where constraints depend on each other, as when an in
 twice. The multipliers are then not unique, but the correction is, if the constraints do not
 contradict each other. There are three ways to solve such a system.
 
-- Up to four constraints: Gaussian elimination with pivots from the diagonal, written out in
+- Up to four constraints: Gaussian elimination with diagonal pivoting, written out in
   scalars. The next constraint is that whose gradient has the largest angle to the span of the
   gradients before it. If the gradient is in this span, its pivot is roundoff, and the multiplier is
   set to zero: if the other constraints hold, this one holds too. Gradients that are only nearly
   parallel are all kept, because a correction needs the direction in which they differ. A derivative
   does not need it, and would lose its digits in that direction; see `implicit`. Below double
   precision, the last iteration, which only polishes, does not need it either; see `iterate`.
-- More constraints: elimination without pivots for up to sixteen, otherwise LU factors by LAPACK,
+- More constraints: elimination without pivoting for up to sixteen, otherwise LU factors by LAPACK,
   with a small share of the diagonal added, so that no pivot vanishes. In a derivative the share is
   the least pivot that counts, so that smaller ones have hardly an effect.
 - A sparse matrix: factors in blocks, with one share for corrections and derivatives.
@@ -112,7 +112,7 @@ class AbstractRows(eqx.Module):
         of about `ε`, half of the digits of what is divided by it are right."""
         return eps_of(self.dtype) ** 0.5
 
-    def best_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
+    def least_squares_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
         """The `λ` for which `Uᵀ λ` is nearest to a change, without nearly dependent rows."""
         return self.gram(self).solve(
             self.matvec(change), pivot_tolerance=self.derivative_pivot_tolerance()
@@ -122,9 +122,9 @@ class AbstractRows(eqx.Module):
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
-    In `solve` and in `row_space_correction` of a small matrix `pivot_tolerance` is the least pivot
-    that counts, by default roundoff. A larger matrix has it, or by default a power of roundoff,
-    added to its diagonal. Sparse matrices ignore it.
+    A small matrix ignores pivots of at most `pivot_tolerance`, by default roundoff, except in
+    `factorise`. A larger one adds it to its diagonal, by default a power of roundoff. A sparse one
+    ignores it.
     """
 
     @abc.abstractmethod
@@ -201,21 +201,26 @@ class DenseRows(AbstractRows):
         return row_scales * lengths, rows.divide_rows(lengths)
 
 
-@final
-class PivotedGram(AbstractGram):
-    """The Gram matrix of up to four rows."""
+class _DenseGram(AbstractGram):
+    """A Gram matrix as a matrix."""
 
     matrix: Float[Array, "m m"]
 
     def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
         return _transposed_product(x, self.matrix.T)
 
+
+@final
+class PivotedGram(_DenseGram):
+    """The Gram matrix of up to four rows."""
+
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         del pivot_tolerance
-        matrix, unit = _equilibrated(self.matrix)
+        matrix, equilibration = _equilibrated(self.matrix)
         one = jnp.eye(len(matrix), dtype=matrix.dtype)
         inverse_upper_t, inverse_lower, _ = forward_elimination(matrix, one, one)
-        return _Inverses(inverse_lower, inverse_upper_t.T, unit)
+        solve = jtu.Partial(_inverse_product, inverse_lower, inverse_upper_t.T)
+        return _Equilibrated(solve, equilibration, matrix.dtype)
 
     def solve(
         self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None
@@ -243,16 +248,11 @@ class PivotedGram(AbstractGram):
 
 
 @final
-class RegularisedGram(AbstractGram):
+class RegularisedGram(_DenseGram):
     """The Gram matrix of more rows."""
 
-    matrix: Float[Array, "m m"]
-
-    def matvec(self, x: Float[Array, " m"]) -> Float[Array, " m"]:
-        return _transposed_product(x, self.matrix.T)
-
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
-        matrix, unit = _equilibrated(self.matrix)
+        matrix, equilibration = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
         eps, one = eps_of(matrix), jnp.eye(len(matrix), dtype=dtype)
         added = (
@@ -262,45 +262,36 @@ class RegularisedGram(AbstractGram):
         )
         matrix = matrix.astype(dtype) + added * one
         if len(matrix) > MAX_BLOCK:
-            return _Substitutions(lu_factors(matrix), unit)
-        return _Inverses(*inverse_factors(matrix), unit)
+            # To invert larger factors takes longer than the few substitutions of a step.
+            return _Equilibrated(jtu.Partial(lu_solution, lu_factors(matrix)), equilibration, dtype)
+        return _Equilibrated(
+            jtu.Partial(_inverse_product, *inverse_factors(matrix)), equilibration, dtype
+        )
 
 
-class _Inverses(eqx.Module):
-    """Two matrices whose product is the inverse of a small matrix. A solve is two products,
-    which XLA fuses with what is around them.
+class _Equilibrated(eqx.Module):
+    """`A⁻¹ b` by a `solve` for `D A D`, where `equilibration` is the diagonal of `D`."""
 
-    - `unit`: the rows and columns of the matrix are multiplied by it, so that the diagonal is one.
-    """
-
-    below: Float[Array, "m m"]
-    above: Float[Array, "m m"]
-    unit: Float[Array, " m"]
-
-    def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
-        x = (b * self.unit).astype(self.below.dtype)
-        x = _transposed_product(_transposed_product(x, self.below.T), self.above.T)
-        return x.astype(b.dtype) * self.unit
-
-
-class _Substitutions(eqx.Module):
-    """The factors of a larger matrix by LAPACK. A solve is two substitutions: to invert the factors
-    takes longer than the few solves of a step."""
-
-    factors: tuple[Array, Array]
-    unit: Float[Array, " m"]
+    solve: Solve
+    equilibration: Float[Array, " m"]
+    dtype: Any = eqx.field(static=True)
 
     def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
-        x = (b * self.unit).astype(self.factors[0].dtype)
-        return lu_solution(self.factors, x).astype(b.dtype) * self.unit
+        x = self.solve((b * self.equilibration).astype(self.dtype))
+        return x.astype(b.dtype) * self.equilibration
+
+
+def _inverse_product(left: Array, right: Array, b: Array) -> Array:
+    """`right (left b)`, two products that XLA fuses with what is around them."""
+    return _transposed_product(_transposed_product(b, left.T), right.T)
 
 
 def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:
-    """The matrix with its rows and columns multiplied by units such that the diagonal is one, and
-    the units."""
+    """The matrix with its rows and columns multiplied by factors such that the diagonal is one, and
+    the factors."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
-    unit = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    return matrix * unit[:, None] * unit, unit
+    equilibration = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    return matrix * equilibration[:, None] * equilibration, equilibration
 
 
 def _transposed_product(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:

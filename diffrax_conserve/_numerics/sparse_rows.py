@@ -90,8 +90,7 @@ class SparseRows(AbstractRows):
                 """The products of the rows of each block with those of the next. They are sums over
                 the components that both have, so the next rows are taken at the components of the
                 first."""
-                later = jnp.concatenate([later[1:], jnp.zeros_like(later[:1])])
-                later = jnp.take_along_axis(later, np.minimum(over, width - 1), axis=2)
+                later = jnp.take_along_axis(_after(later), np.minimum(over, width - 1), axis=2)
                 return jnp.sum(rows[:, :, None] * jnp.where(over < width, later, 0)[:, None], 3)
 
             following = coupling(ours, theirs)

@@ -10,7 +10,6 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import VF, Args, RealScalarLike, Y
 from .._manifold import check_vector_field
-from .._options import check_numbers
 from .._tree import ravel, unravel
 from .options import check_state
 from .within_bounds import Bounds, check_bounds
@@ -76,8 +75,6 @@ def clipped(
         ```
     """
     check_vector_field(vector_field)
-    for name, bound in (("lower", lower), ("upper", upper)):
-        check_numbers(name, bound, least=-float("inf"))
     check_bounds(lower, upper)
     if lower is None and upper is None:
         raise ValueError("`clipped` needs a bound. Pass `lower=` or `upper=`, or both.")

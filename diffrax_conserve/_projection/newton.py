@@ -76,14 +76,12 @@ class Newton(AbstractNewton):
         given = _Given(problem.dense(), candidate, bounds)
         if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
             first = _some_point(problem, given, self.max_steps)
-            y, count = given.clip(first.y), first.num_iterations
-            y = nan_tangent_unless(y, False)
+            y, more = nan_tangent_unless(given.clip(first.y), False), 0
         else:
             problem, still = tree_stop_gradient((problem, given))
             first = _some_point(problem, still, self.max_steps)
-            y, count = _nearest(given, first.y, self.max_steps)
-            count = first.num_iterations + count
-        return y, problem.report(candidate, y, count)
+            y, more = _nearest(given, first.y, self.max_steps)
+        return y, problem.report(candidate, y, first.num_iterations + more)
 
 
 Newton.__init__.__doc__ = NEWTON_OPTIONS
@@ -146,7 +144,6 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
     scale = problem.scale(jacobian, y)
-    eps = eps_of(y)
 
     def tolerance(default: float, of_user: Any) -> Array:
         """The tolerances of the user are for the constraints. The others hold to roundoff."""
@@ -161,10 +158,14 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         cancellation=jnp.concatenate([jnp.zeros_like(y), problem.cancellation]),
         changes=None,
         factor=Identity(),
-        rtol=tolerance(ROUNDOFF * eps, problem.rtol),
+        rtol=tolerance(ROUNDOFF * eps_of(y), problem.rtol),
         atol=tolerance(0.0, problem.atol),
     )
-    return conditions, jnp.concatenate([jnp.zeros_like(y), rows.best_multiplier(change)]), tested
+    return (
+        conditions,
+        jnp.concatenate([jnp.zeros_like(y), rows.least_squares_multiplier(change)]),
+        tested,
+    )
 
 
 def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]:

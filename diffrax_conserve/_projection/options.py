@@ -1,6 +1,5 @@
 """The options that projections share: defaults, checks, and the text that documents them."""
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 
 from .._custom_types import Y
-from .._options import check_counts, check_number, check_numbers, dtype_of
+from .._options import check_counts, check_number, dtype_of
 
 
 def option(default: Any, **kwargs: Any) -> Any:
@@ -17,13 +16,10 @@ def option(default: Any, **kwargs: Any) -> Any:
 
 
 def check_options(projection: Any) -> None:
-    """Raises unless the tolerances, the number of iterations and the bounds are valid."""
+    """Raises unless the tolerances and the number of iterations are valid."""
     for name in ("rtol", "atol"):
         check_number(name, getattr(projection, name), least=0.0)
-    if hasattr(projection, "max_steps"):
-        check_counts(max_steps=projection.max_steps)
-    for name in ("lower", "upper"):
-        check_numbers(name, getattr(projection, name, None), least=-math.inf)
+    check_counts(max_steps=projection.max_steps)
 
 
 # The options that the Newton iterations share.

@@ -92,10 +92,9 @@ def _projected(
     y, info = projection.solve(problem(at_candidate), vector)
     # If the projection failed, its result may be NaN, where nothing can be measured.
     usable = unravel(jnp.where(jnp.isfinite(y), y, vector), candidate)
-    value, jacobian, there = cancellation_scale(manifold, t, usable, args)
+    shown, _, there = cancellation_scale(manifold, t, usable, args)
     # A projection may have tolerances of its own. If it reports a success, we believe it, unless
     # the scale at the result is less than half of the cancellation at the candidate.
-    shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(ravel(usable)))
     judged = problem(there)
     ok = tree_stop_gradient(judged).is_on_manifold(lax.stop_gradient(y))
     ok = ok | info.ok & jnp.all(at_candidate <= 2 * (shown + there))

@@ -1,7 +1,6 @@
 """The iteration of Hairer, Lubich and Wanner, IV.4, for candidates that are as close to the
 manifold as the local error of a step. It moves along the gradients at the candidate.
-The iteration itself is in `iterate`, that within bounds in `within_bounds`, the derivative in
-`implicit`."""
+The iterations are in `iterate`, the bounds in `within_bounds`, the derivative in `implicit`."""
 
 from typing import final
 

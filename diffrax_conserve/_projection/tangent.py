@@ -22,7 +22,6 @@ from .._manifold import (
     evaluate,
     has_value,
     named_entries,
-    rate_of,
     slope_of,
 )
 from .._numerics.metric import factor_of, positive_weights
@@ -114,7 +113,7 @@ def tangent(
                 "too."
             )
         why = "" if has_value(entry) else "has no value that it could return to"
-        why = why if rate_of(entry) is None else "changes at its `rate`"
+        why = why if entry.rate is None else "changes at its `rate`"
         if damped and why:
             raise ValueError(
                 f"`gain` is {gain}, but `{name}` {why}. Write `FirstIntegral(fn, value=...)` "

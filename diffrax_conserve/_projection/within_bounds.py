@@ -10,6 +10,7 @@ nearest point within the bounds.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -25,6 +26,7 @@ from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.iterate import Solved, projected_newton
 from .._numerics.metric import broadcast_option, positive_weights
 from .._numerics.problem import Problem
+from .._options import check_numbers
 from .._printing import is_traced
 from .base import AbstractProjection
 from .options import check_options, option
@@ -55,11 +57,6 @@ class Bounds(eqx.Module):
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
         return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
-    def compose(self, problem: Problem) -> Problem:
-        """The equations of a manifold as functions of `z`."""
-        functions = tuple(eqx.Partial(_clipped, self, fn) for fn in problem.functions)
-        return dataclasses.replace(problem, functions=functions, clip=self.clip)
-
 
 def _clipped(bounds: Bounds, fn: Callable[[Array], Array], z: Array) -> Array:
     return fn(bounds.clip(z))
@@ -76,7 +73,8 @@ def project_within(
     iterations are allowed.
     """
     rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
-    within = bounds.compose(problem)
+    functions = tuple(eqx.Partial(_clipped, bounds, fn) for fn in problem.functions)
+    within = dataclasses.replace(problem, functions=functions, clip=bounds.clip)
     return implicit_solution(
         MultiplierSystem(
             within, candidate, rows, iteration=projected_newton, max_steps=2 * max_steps
@@ -115,6 +113,8 @@ class AbstractNewton(AbstractProjection):
 def check_bounds(lower: PyTree[ArrayLike] | None, upper: PyTree[ArrayLike] | None) -> None:
     """Raises if a lower bound is above its upper bound, as far as both are known and have the same
     structure. If one is a tracer, `Bounds.clip` returns NaN instead."""
+    for name, bound in (("lower", lower), ("upper", upper)):
+        check_numbers(name, bound, least=-math.inf)
     for a, b in zip(jtu.tree_leaves(lower), jtu.tree_leaves(upper), strict=False):
         if not is_traced((a, b)) and not np.all(np.asarray(a) <= np.asarray(b)):
             raise ValueError(f"`lower` is {lower}, but it must be at most `upper`, {upper}.")

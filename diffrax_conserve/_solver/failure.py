@@ -59,24 +59,22 @@ def starts_off_manifold(
 ) -> Bool[Array, ""]:
     """Whether a residual at a state exceeds its tolerance, and also `√ε` of its scale.
 
-    Not tested are integrals with a `value` of their own, because the first projection moves the
-    state there, and integrals whose gradient is NaN, as that of the speed is at rest. `√ε` is
-    usually much larger than the tolerance of a projection, because initial states are often given
-    with a few digits less. The scale contains the changes of the state in a step, because all terms
-    may be roundoff at one state, such as those of `q · v = 0` where a component of a pendulum
-    passes zero.
+    Not tested are integrals with a `value`, to which the first projection moves the state, and
+    integrals whose gradient is NaN, as that of the speed is at rest. The limit is `√ε`, because
+    initial states are often given with fewer digits. The changes of the state in a step enter the
+    scale, because all terms may vanish at one state.
     """
     g, jacobian = problem.linearise(y)
     scale = problem.scale(jacobian, y)
     limit = jnp.maximum(eps_of(y) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
-    counts = problem.per_residual([binds_start(entry) for entry in entries])
+    counts = problem.per_residual([needs_consistent_start(entry) for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
     unknown = jnp.isnan(limit) & ~is_constraint
     return jnp.any(counts & ~unknown & ~(jnp.abs(g) <= limit))
 
 
-def binds_start(entry: Any) -> bool:
+def needs_consistent_start(entry: Any) -> bool:
     """Whether the first state of a solve must be on an entry of the manifold."""
     return isinstance(entry, Constraint) or entry.value is None
 
@@ -97,10 +95,8 @@ def failure_cause(
       of advising shorter steps.
     """
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
-    finite, finite_values = (
-        jnp.abs(jnp.sum(must_be_finite)) < jnp.inf,
-        jnp.all(jnp.isfinite(values)),
-    )
+    finite = jnp.abs(jnp.sum(must_be_finite)) < jnp.inf
+    finite_values = jnp.all(jnp.isfinite(values))
     cause = jnp.where(ok, 0, jnp.where(unreachable, _NO_STATE, _NOT_REACHED))
     cause = jnp.where(ok & too_far, _TOO_FAR, cause)
     cause = jnp.where(cannot_start, _START, cause)
@@ -115,10 +111,9 @@ def is_shortest_step(
 ) -> Bool[Array, ""]:
     """Whether a step that failed is so short that no shorter one is better.
 
-    A controller answers a failed step by a shorter one. That ends when a step moves each component
-    by no more than roundoff, or when no time passes: the length of the step is roundoff of the
-    `time`, the larger one of the time itself and the length of the first step. Time alone would not
-    do, because many solves start at zero, beside which every step is long.
+    A controller answers a failed step by a shorter one. That ends when no component moves by more
+    than roundoff, or when the length of the step is roundoff of the `time`, the larger one of the
+    time itself and the length of the first step. The time alone would not do in a solve from zero.
     """
     size = jnp.abs(candidate)
     at_rest = jnp.all(change <= ROUNDOFF * eps_of(size) * size)

@@ -15,9 +15,9 @@ from .._balance import has_rates
 from .._constants import ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import AsArrays, MakeManifoldInterpolation
-from .._manifold import Constraint, check_manifold, named_entries
+from .._manifold import Constraint, check_manifold, entry_names, named_entries
 from .._numerics.iterate import any_lane
-from .._numerics.metric import Diagonal, Identity
+from .._numerics.metric import AbstractFactor, Diagonal, Identity
 from .._numerics.problem import Step, step_norm
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
@@ -27,11 +27,11 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._time import FieldTime
 from .._tree import eps_of, irregular_weights, ravel, tree_add, unravel
 from .failure import (
-    binds_start,
     error_for_controller,
     failure_cause,
     is_shortest_step,
     masked_step,
+    needs_consistent_start,
     starts_off_manifold,
 )
 from .state import State, initial_values, updated_units
@@ -195,7 +195,9 @@ class ManifoldProjection(ForwardingSolver):
         )
         return State(
             inner=self.solver.init(terms, t0, t1, y0, args),
-            constants=jnp.concatenate([values, cancellation, first_step_size.astype(values.dtype)]),
+            packed_constants=jnp.concatenate(
+                [values, cancellation, first_step_size.astype(values.dtype)]
+            ),
             rate_integrals=jnp.zeros((2, values.size), values.dtype)
             if has_rates(self.manifold)
             else None,
@@ -225,9 +227,9 @@ class ManifoldProjection(ForwardingSolver):
         state, start_target = self._target(terms, state, wrapped, y0, args)
         target = start_target.add_rates(step.t0, step.t1, wrapped.path)
         y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
-        cause, is_final = self._verdict(start_target, state, wrapped, y1, info, made_jump)
-        y1, result = masked_step(cause, y1, wrapped.result)
         metric = start_target.metric(step.t0, step.y0)
+        cause, is_final = self._verdict(start_target, state, wrapped, metric, y1, info, made_jump)
+        y1, result = masked_step(cause, y1, wrapped.result)
         dense_info = dict(
             inner=wrapped.dense_info,
             field_time=wrapped.field_time,
@@ -257,8 +259,8 @@ class ManifoldProjection(ForwardingSolver):
         inner: Any,
         made_jump: BoolScalarLike,
     ) -> "_WrappedStep":
-        """The step of the wrapped solver. From here on states are vectors, and times those of the
-        vector field."""
+        """The step of the wrapped solver: `step` and `candidate` as vectors, in the time of the
+        vector field, the rest as that solver returns it."""
         inner_made_jump = made_jump if self._forwards_made_jump else True
         y1, error, dense_info, inner, result = self.solver.step(
             terms, t0, t1, y0, args, inner, inner_made_jump
@@ -287,7 +289,7 @@ class ManifoldProjection(ForwardingSolver):
         return isinstance(innermost(self.solver), dfx.AbstractImplicitSolver | dfx.QUICSORT)
 
     def _checked(self, state: Any) -> State:
-        names = tuple(name for name, _ in named_entries(self.manifold))
+        names = entry_names(self.manifold)
         if isinstance(state, State) and state.statistics.names == names:
             return state
         of = "a solve by another solver"
@@ -339,6 +341,7 @@ class ManifoldProjection(ForwardingSolver):
         target: Target,
         state: State,
         wrapped: "_WrappedStep",
+        metric: AbstractFactor,
         y1: Float[Array, " n"],
         info: ProjectionInfo,
         made_jump: BoolScalarLike,
@@ -352,7 +355,6 @@ class ManifoldProjection(ForwardingSolver):
         is_final = cannot_start | is_shortest_step(step_size, time, target.changes, candidate)
         correction, too_far = y1 - candidate, False
         if self.max_correction is not None:
-            metric = target.metric(step.t0, step.y0)
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_norm(step.y0, candidate, metric)
             too_far = metric.norm(correction) > limit
@@ -374,7 +376,7 @@ class ManifoldProjection(ForwardingSolver):
         after a jump of the vector field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         entries = [entry for _, entry in named_entries(self.manifold)]
-        if not any(map(binds_start, entries)):
+        if not any(map(needs_consistent_start, entries)):
             return invalid_values
         # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
         # comparison is false, and its projection fails.
@@ -399,9 +401,9 @@ def _checksum(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]
 def first_displacements(
     terms: PyTree[dfx.AbstractTerm], t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
 ) -> Float[Array, "k n"]:
-    """The displacements of two steps of Euler's method, because no step comes before the first. A
-    method of one stage has a single slope in its first step, along which integrals hardly change,
-    so that a correction in the span of it would undo the step."""
+    """The displacements of two steps of Euler's method, because no step comes before the first. In
+    its first step a method of one stage has a single slope, along which integrals hardly change. A
+    correction in the span of it would undo the step."""
     y = ravel(y0)
     changes = jnp.zeros((2 * _NUM_DISPLACEMENTS, y.size), y.dtype)
     if not (is_ode(terms) and isinstance(terms, dfx.AbstractTerm)):

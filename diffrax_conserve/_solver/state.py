@@ -19,7 +19,7 @@ class State(eqx.Module):
     """What later steps need.
 
     - `inner`: the state of the wrapped solver.
-    - `constants`: `values` and `cancellation` as in a `Target`, and `first_step_size`, the
+    - `packed_constants`: `values` and `cancellation` as in a `Target`, and `first_step_size`, the
       length of the first step that was tried, a scale of the times of the solve. They are one
       array, because in a gradient each array of the state is saved and restored.
     - `rate_integrals`: as in a `Target`.
@@ -32,7 +32,7 @@ class State(eqx.Module):
     """
 
     inner: Any
-    constants: Float[Array, " constants"]
+    packed_constants: Float[Array, " constants"]
     rate_integrals: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
     last_checksum: Float[Array, ""]
@@ -41,15 +41,15 @@ class State(eqx.Module):
 
     @property
     def values(self) -> Float[Array, " m"]:
-        return self.constants[: len(self.constants) // 2]
+        return self.packed_constants[: len(self.packed_constants) // 2]
 
     @property
     def cancellation(self) -> Float[Array, " m"]:
-        return self.constants[len(self.constants) // 2 : -1]
+        return self.packed_constants[len(self.packed_constants) // 2 : -1]
 
     @property
     def first_step_size(self) -> Float[Array, ""]:
-        return self.constants[-1]
+        return self.packed_constants[-1]
 
 
 def initial_values(
@@ -69,9 +69,8 @@ def updated_units(
 
     The unit of a quantity in a step is the geometric mean of its size and its change. Each alone
     misleads: a quantity may be large only because its origin is far away, and it may hardly change
-    for a while, at a turning point, or along the axis of a rotation. Where the sum of two squares
-    is constant, as the length of a vector or the energy of an oscillator, `|y Δy|` is the same for
-    both.
+    for a while, at a turning point, or along the axis of a rotation. To first order `|y Δy|` is the
+    same for two components with a constant sum of squares, as `q` and `p` of an oscillator.
 
     A quantity that hardly changes counts as changing by `ε` of itself. This floor is inside the
     root, so that the derivative stays finite, and the root is that of a ratio, so that nothing is
@@ -79,9 +78,9 @@ def updated_units(
     """
     size = largest_of_quantity(jnp.maximum(jnp.abs(end), change), like)
     change = largest_of_quantity(change, like)
-    share = change / jnp.where(size > 0, size, 1)
-    share = jnp.maximum(share, eps_of(change))
-    return jnp.maximum(units, size * jnp.sqrt(share))
+    ratio = change / jnp.where(size > 0, size, 1)
+    ratio = jnp.maximum(ratio, eps_of(change))
+    return jnp.maximum(units, size * jnp.sqrt(ratio))
 
 
 def largest_of_quantity(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
@@ -89,10 +88,9 @@ def largest_of_quantity(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
     state like `like`.
 
     Each component of a state is a quantity, with a unit of its own: here, and wherever this package
-    judges errors or drifts. There is one exception. If the components of a vector, such as the
-    position of a body, had different units, corrections would turn the vector. So in a state of
-    several leaves, in which unlike quantities can be kept apart, each vector along the last axis of
-    a leaf has one unit. A single array may hold unlike quantities.
+    judges errors or drifts. In a state of several leaves each vector along the last axis of a leaf,
+    such as the position of a body, is one quantity, because with different units for its components
+    corrections would turn it. A single array may hold unlike quantities.
     """
     if len(jtu.tree_leaves(like)) == 1:
         return x

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._custom_types import Manifold
-from .._manifold import named_entries
+from .._manifold import entry_names
 from .._numerics.report import ProjectionInfo
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
 
-# Corrections are usually shorter than the error estimate of their step, because that is the
-# estimate for a method of lower order. If one is longer by this factor, the quantity is probably
+# Corrections are usually shorter than error estimates, because these are for a method of lower
+# order. If the largest correction is this many times the largest estimate, the quantity is probably
 # not conserved. The number is a choice.
 _MAX_PLAUSIBLE = 10
 
@@ -60,7 +60,7 @@ class ProjectionStatistics(eqx.Module):
     def zero(
         cls, manifold: Manifold, dtype: jnp.dtype, bounded: bool = False
     ) -> "ProjectionStatistics":
-        names = tuple(name for name, _ in named_entries(manifold))
+        names = entry_names(manifold)
         counts, sizes = jnp.array([0, 0, 0, -1]), jnp.array([0, 0, 0, 0, jnp.nan], dtype)
         return cls(counts, sizes, names, bounded)
 

@@ -13,7 +13,7 @@ from .._constants import NOISE, ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._numerics.metric import AbstractFactor, PreferredSubspace, factor_of
 from .._numerics.problem import Problem, Step, problem_of
-from .._projection.base import AbstractProjection, with_options
+from .._projection.base import AbstractProjection
 from .._tree import ravel, tree_stop_gradient, unravel
 
 # The solution between two times of the vector field, as a vector.
@@ -30,7 +30,7 @@ class Target(eqx.Module):
     - `cancellation`: the part of the scales of the residuals that no gradient shows.
     - `changes`: how far each component moves in the step.
     - `factor`: the factor of the metric where the projection has none of its own: of the metric of
-      motion, or with noise of the Euclidean one.
+      motion, or for a stochastic equation of the Euclidean one.
     - `rate_integrals`: in the first row the integrals of the rates since the start of the solve, in
       the second Kahan's compensation, which is subtracted from the next increment; `None` if no
       entry has a rate.
@@ -60,10 +60,12 @@ class Target(eqx.Module):
             return self
         last, compensation = self.rate_integrals
         states = lambda t: unravel(path(t), self.like)  # noqa: E731
-        more = integrated_rates(self.manifold, start, end, states, self.args)
-        more = ravel(more).astype(last.dtype) - compensation
-        total = last + more
-        return dataclasses.replace(self, rate_integrals=jnp.stack([total, (total - last) - more]))
+        increment = integrated_rates(self.manifold, start, end, states, self.args)
+        increment = ravel(increment).astype(last.dtype) - compensation
+        total = last + increment
+        return dataclasses.replace(
+            self, rate_integrals=jnp.stack([total, (total - last) - increment])
+        )
 
     def absorb_rate_roundoff(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
         """The target with values that a state `y` on the manifold can keep.
@@ -71,17 +73,17 @@ class Target(eqx.Module):
         The rate of a balance may vanish, for example when friction has stopped a pendulum. Its
         integral then keeps an error of roundoff, say an energy of -1e-17, which no state has: all
         later projections would fail. So where the residual at the start of a step is within the
-        tolerance, but larger than half of the noise level, the conserved value is moved until the
-        residual is half of the noise level.
+        tolerance, but larger than half of what counts as noise, the conserved value is moved until
+        the residual is that half.
         """
         if self.rate_integrals is None:
             return self
         problem, y = tree_stop_gradient((self.problem(t, y), y))
         residual, jacobian = problem.linearise(y)
         limit = problem.tolerance(problem.scale(jacobian, y))
-        within = (self.rate_integrals[0] != 0) & (jnp.abs(residual) <= limit)
+        is_small = (self.rate_integrals[0] != 0) & (jnp.abs(residual) <= limit)
         half_noise = NOISE / ROUNDOFF * limit / 2
-        follow = jnp.where(within, residual - jnp.clip(residual, -half_noise, half_noise), 0)
+        follow = jnp.where(is_small, residual - jnp.clip(residual, -half_noise, half_noise), 0)
         # `add_rates` subtracts the second row from the next increment, so that `-follow` there
         # raises the value by `follow`.
         return dataclasses.replace(self, rate_integrals=self.rate_integrals.at[1].add(-follow))
@@ -99,9 +101,19 @@ class Target(eqx.Module):
             decrease = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
             cancellation = cancellation + decrease
         step = step if self.projection.sees_step else None
-        fields = dict(factor=self.factor, changes=self.changes, step=step)
-        problem = problem_of(self.manifold, values, t, self.like, self.args, cancellation, **fields)
-        problem = with_options(problem, self.projection, y)
+        problem = problem_of(
+            self.manifold,
+            values,
+            t,
+            self.like,
+            self.args,
+            cancellation,
+            factor=self.metric(t, y),
+            changes=self.changes,
+            step=step,
+            rtol=self.projection.rtol,
+            atol=self.projection.atol,
+        )
         if self.displacements is None:
             return problem
         factor = PreferredSubspace.spanned_by(problem.factor, self.displacements)
