@@ -12,10 +12,9 @@ from jaxtyping import PRNGKeyArray
 from .._projection.newton import Newton
 from .._solver.manifold_projection import ManifoldProjection
 from ..learned import ConservativeLayer, FitLog, paper
-from ..learned._files import load, read_info
+from ..learned._files import load, pretrained_path, read_info
 from ..learned._networks.deeponet import DeepONet
 from ..learned._networks.pinn import PINN
-from ..learned._pretrained import pretrained_path
 from ..learned._solvers.flow_map_solver import DeepONetSolver
 from ..learned._solvers.pinn_solver import PINNSolver
 from ..learned._training.fit import fit

@@ -28,9 +28,9 @@ from .._networks.trainable import Points, checked_part
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
+from .loop import FitState
 from .objective import Problem, VectorField
 from .recipe import Recipe, second_order
-from .state import FitState
 
 # The derivative of a first integral, relative to its terms, is roundoff. Single precision has much
 # of it at rest, where these terms are small.

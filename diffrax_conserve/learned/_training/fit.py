@@ -16,10 +16,9 @@ from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
 from .checks import check_types, checked, checked_sharding
 from .errors import flow_map_error, warn_off_manifold
-from .loop import FitLog, Loop, Progress
+from .loop import FitLog, FitState, Loop, Progress
 from .objective import Carry, VectorField
 from .recipe import Recipe
-from .state import FitState
 from .windows import train_windows
 
 _Model = TypeVar("_Model", bound=eqx.Module)
