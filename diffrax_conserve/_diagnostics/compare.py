@@ -20,11 +20,12 @@ import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import check_manifold, check_vector_field, is_entry, slope_of
+from .._manifold import check_manifold, check_vector_field, slope_of
 from .._options import ONE_STATE, calling, check_counts, check_number, dtype_of
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
-from .._tree import key_of, tree_size
+from .._tree import tree_size
+from .check_invariance import entries_of
 from .compared_solves import Task, drifts, references, sizes_of, switched, timed
 from .comparison import (
     NOTHING,
@@ -167,7 +168,7 @@ def compare(
     start = jnp.asarray(t0, dtype)
     with calling("`vector_field`", "vector_field(t, y, args)", t0, first, args):
         eqx.filter_eval_shape(lambda y: slope_of(vector_field, start, y, args), first)
-    entries = entries_of(manifold)
+    entries = dict(entries_of(manifold))
     dense = any(getattr(entry, "rate", None) is not None for entry in entries.values())
     steps = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
     task = Task(
@@ -286,12 +287,6 @@ def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
 # ---- The variants ----
 
 
-def entries_of(manifold: Manifold) -> dict[str, Any]:
-    """The entries by name, such as `energy` for `manifold["energy"]`."""
-    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    return {".".join(str(key_of(x)) for x in path) or "manifold": entry for path, entry in flat}
-
-
 class _Variant(NamedTuple):
     """One solver to compare: its name, the entries that it keeps, itself for the user, and in the
     form in which it is compiled together with others."""
@@ -310,7 +305,7 @@ def _variants(
     metrics: dict[str, Any],
 ) -> list[_Variant]:
     """The solvers with projections. Without metrics all entries are kept only."""
-    entries, found = entries_of(manifold), []
+    entries, found = dict(entries_of(manifold)), []
     leave_out = metrics and 1 < len(entries) <= _LEFT_OUT
     changed = {name: dataclasses.replace(projection, metric=x) for name, x in metrics.items()}
     for left_out in (None, *(entries if leave_out else ())):

@@ -15,23 +15,6 @@ from ._job import reproduce as _reproduce
 from ._verdict import verdict
 
 _NAMES = (*systems.names(), *systems.names(stiff=True))
-_EXAMPLES = """examples:
-  diffrax-conserve list
-  diffrax-conserve reproduce kepler --out out/kepler
-  diffrax-conserve compare kepler
-"""
-_EXAMPLES_OF_LIST = """example:
-  diffrax-conserve list
-"""
-_EXAMPLES_OF_REPRODUCE = """examples:
-  diffrax-conserve reproduce kepler
-  diffrax-conserve reproduce kepler --t1 50 --dt 0.1 --out out/longer
-  diffrax-conserve reproduce rigid-body --train --epochs 500 --seed 1
-"""
-_EXAMPLES_OF_COMPARE = """examples:
-  diffrax-conserve compare lotka-volterra
-  diffrax-conserve compare rigid-body --tol 1e-6 --starts 8 --out out/verdict
-"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -105,11 +88,11 @@ def run() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     title = "Conservative solves of the systems in the catalogue."
-    raw: Any = dict(formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser = argparse.ArgumentParser("diffrax-conserve", description=title, epilog=_EXAMPLES, **raw)
+    every = "list", "reproduce kepler --out out/kepler", "compare kepler"
+    parser = argparse.ArgumentParser("diffrax-conserve", description=title, **_examples(*every))
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    commands.add_parser("list", help="list the systems by name", epilog=_EXAMPLES_OF_LIST, **raw)
+    commands.add_parser("list", help="list the systems by name", **_examples("list"))
     reproduce = commands.add_parser(
         "reproduce",
         help="compare solvers of a system, plain and projected",
@@ -118,18 +101,12 @@ def _parser() -> argparse.ArgumentParser:
             "and for the paper's five systems learned solvers too. Prints a table of errors and\n"
             "drifts, and writes figures and metrics.json."
         ),
-        epilog=_EXAMPLES_OF_REPRODUCE,
-        **raw,
+        **_examples(
+            "reproduce kepler",
+            "reproduce kepler --t1 50 --dt 0.1 --out out/longer",
+            "reproduce rigid-body --train --epochs 500 --seed 1",
+        ),
     )
-    reproduce.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
-    reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
-    reproduce.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
-    reproduce.add_argument(
-        "--dt", type=float, metavar="H", help="length of a step, or of a saved one if stiff"
-    )
-    reproduce.add_argument("--train", action="store_true", help="train the networks again")
-    reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
-    reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
     compare = commands.add_parser(
         "compare",
         help="say whether a projection makes a solution of a system better",
@@ -138,11 +115,21 @@ def _parser() -> argparse.ArgumentParser:
             "them left out, in several metrics. Prints errors and drifts, and says what to take.\n"
             "The solver is RK4, with a tolerance Tsit5, and for stiff systems Kvaerno5."
         ),
-        epilog=_EXAMPLES_OF_COMPARE,
-        **raw,
+        **_examples(
+            "compare lotka-volterra",
+            "compare rigid-body --tol 1e-6 --starts 8 --out out/verdict",
+        ),
     )
-    compare.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
-    compare.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
+    for command in (reproduce, compare):
+        command.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
+        command.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
+    reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
+    reproduce.add_argument(
+        "--dt", type=float, metavar="H", help="length of a step, or of a saved one if stiff"
+    )
+    reproduce.add_argument("--train", action="store_true", help="train the networks again")
+    reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
+    reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
     compare.add_argument("--dt", type=float, metavar="H", help="length of fixed steps")
     compare.add_argument("--tol", type=float, metavar="X", help="tolerance of adaptive steps")
     compare.add_argument(
@@ -151,3 +138,9 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--seed", type=int, metavar="N", default=0, help="of them (default: 0)")
     compare.add_argument("--out", type=Path, metavar="DIR", help="for a figure of the errors")
     return parser
+
+
+def _examples(*calls: str) -> dict[str, Any]:
+    """The options of a parser that shows these calls below its help."""
+    text = "\n".join(["examples:", *(f"  diffrax-conserve {call}" for call in calls)])
+    return dict(epilog=text, formatter_class=argparse.RawDescriptionHelpFormatter)

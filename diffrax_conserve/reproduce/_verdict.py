@@ -49,9 +49,10 @@ def verdict(
     y0 = system.y0
     if starts is not None:
         y0 = jax.vmap(system.sample)(jr.split(jr.key(seed), starts))
+    solver, options = _solver(system, dt, tol)
     report = compare(
-        system.vector_field, *_solver(system, dt, tol), y0, t1=system.t1 if t1 is None else t1,
-        batch=starts is not None, metric=system.metric, **_options(system, dt, tol),
+        system.vector_field, solver, system.manifold, y0, t1=system.t1 if t1 is None else t1,
+        batch=starts is not None, metric=system.metric, **options,
     )  # fmt: skip
     if plot is not None and out is not None:
         for suffix in ("png", "pdf"):
@@ -62,21 +63,14 @@ def verdict(
 
 def _solver(
     system: AbstractSystem, dt: float | None, tol: float | None
-) -> tuple[dfx.AbstractSolver, Any]:
-    """The solver and the manifold."""
-    solver = RK4() if tol is None else dfx.Tsit5()
+) -> tuple[dfx.AbstractSolver, dict[str, Any]]:
+    """The solver, and options of `compare` that go with it."""
     if isinstance(system, AbstractChemistry):
         if dt is not None:
             raise SetupError(f"--dt: {system.name} is stiff, and needs adaptive steps: give --tol")
-        solver = dfx.Kvaerno5()
-    return solver, system.manifold
-
-
-def _options(system: AbstractSystem, dt: float | None, tol: float | None) -> dict[str, Any]:
-    if isinstance(system, AbstractChemistry):
         tol = _STIFF if tol is None else tol
         projection = system.mechanism.positive_projection()
-        return {"rtol": tol, "atol": _SMALL * tol, "projection": projection}
+        return dfx.Kvaerno5(), {"rtol": tol, "atol": _SMALL * tol, "projection": projection}
     if tol is None:
-        return {"dt0": system.dt if dt is None else dt}
-    return {"rtol": tol, "atol": tol}
+        return RK4(), {"dt0": system.dt if dt is None else dt}
+    return dfx.Tsit5(), {"rtol": tol, "atol": tol}
