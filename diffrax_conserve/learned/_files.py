@@ -130,20 +130,11 @@ def load(
         if body.read(1):
             raise ValueError("it has data after the last array")
         _check(model)
-        if taylor is not None and header.get("slope") is not None:
-            _check_same(
-                "The vector field of `taylor` is",
-                _slope(_unwrapped(model)),
-                header["slope"],
-                "the field, and its `args`,",
-            )
-        if layer is not None and header.get("gradients") is not None:
-            _check_same(
-                "The gradients of the functions of `layer` are",
-                _gradients(_unwrapped(model)),
-                header["gradients"],
-                "the manifold, and its `args`,",
-            )
+        network: Any = _unwrapped(model)
+        if taylor is not None and (slope := header.get("slope")) is not None:
+            _check_same("vector field of `taylor`", _slope(network), slope, "field")
+        if layer is not None and (gradients := header.get("gradients")) is not None:
+            _check_same("Jacobian of `layer`", _gradients(network), gradients, "manifold")
         return model
 
     model = _read(path, build)
@@ -385,6 +376,6 @@ def _check_same(what: str, found: np.ndarray, saved: Any, remedy: str) -> None:
     same = found.shape == saved.shape
     if not same or not np.max(np.abs(found - saved)) <= 1e-3 * np.max(np.abs(saved)):
         raise _NotGiven(
-            f"{what} {found} at a state where the saved network has {saved}. Pass {remedy} for "
-            "which the network was trained."
+            f"The {what} is {found} at a state where the saved network has {saved}. "
+            f"Pass the {remedy}, and its `args`, for which the network was trained."
         )
