@@ -89,22 +89,18 @@ def compare(
     trusted. From the time on at which both differ by more than a third of the smallest error, or
     every error is larger than 0.3, nothing is judged: so chaos is told.
 
-    What to take is the projection with the least error up to then, in the geometric mean over a
-    batch, unless one before it in the table has at most 1.5 times this error: then the first of
-    these, because errors grow faster where less is kept. Only what has an error of less than 0.9
-    times that without projection gains. If nothing does, the first is taken that has at most 1.1
-    times that error, also in each component, and in no lane 1.5 times, and is said to be for what
-    it keeps only; otherwise no projection is. What makes a component more than 3 times less
-    accurate is told, and is taken only if the error falls to less than a third. If all entries kept
-    spoil a component so, as those of a solar system the outer planets beside Mercury, a metric by
-    errors is tried too: the weight of a component is the inverse square of its error without
-    projection, so that what is accurate already is hardly moved. Of more than eight entries none is
-    left out.
+    Taken is the first projection of the table with at most 1.5 times the least error up to then, in
+    the geometric mean over a batch, if that is less than 0.9 times the error without projection. If
+    none is, the first is taken that has at most 1.1 times that error, also in each component, and
+    in no lane 1.5 times, and is said to be for what it keeps only; otherwise no projection is. What
+    makes a component more than 3 times less accurate is told, and is taken only if the error falls
+    to less than a third. If all entries kept spoil a component so, a metric by errors is tried too:
+    the weight of a component is the inverse square of its error without projection. Of more than
+    eight entries none is left out.
 
-    A small system takes half a minute, most of it compilation. Lists that differ in what is left
-    out, and metrics of weights, share programs: so the time of a solve contains the evaluation of
-    the entry that is left out. A linear invariant that nobody declared is a combination of
-    components, of at most 300, that the field conserves at states near the solution.
+    A small system takes half a minute, most of it compilation. The time of a solve contains the
+    evaluation of the entry that is left out. A linear invariant that nobody declared is a
+    combination of components, of at most 300, that the field conserves at states near the solution.
 
     **Arguments:**
 

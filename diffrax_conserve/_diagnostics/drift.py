@@ -120,18 +120,12 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         ```python
         import diffrax
         import diffrax_conserve as dfc
-        import jax.numpy as jnp
 
-        square = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))
-        solver = dfc.ManifoldProjection(diffrax.Tsit5(), square)
-        term = diffrax.ODETerm(lambda t, y, args: jnp.array([-y[1], y[0]]))
-        saveat = diffrax.SaveAt(ts=jnp.linspace(0, 9, 100))
-        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, jnp.array([1.0, 0.0]), saveat=saveat)
-        print(jnp.sum(dfc.off_manifold(sol, square)))
-        ```
-
-        ```text
-        0
+        system = dfc.systems.get("lotka-volterra")
+        solver = dfc.ManifoldProjection(diffrax.Tsit5(), system.manifold)
+        term, saveat = diffrax.ODETerm(system.vector_field), diffrax.SaveAt(t0=True, steps=True)
+        sol = diffrax.diffeqsolve(term, solver, 0, 9, 0.1, system.y0, saveat=saveat)
+        assert not dfc.off_manifold(sol, system.manifold).any()
         ```
     """
     ts, ys, values, residual = _residuals(sol, manifold, args, "off_manifold")

@@ -26,14 +26,9 @@ class ConservativeLayer(eqx.Module):
 
     For the output $\hat y$ with the constraint Jacobian $G(\hat y)$ it solves $g(y) = 0$,
     $y = \hat y + G(\hat y)^\top \lambda$, for the multipliers $\lambda$, by the damped Newton
-    iteration of the projections of a solver, to their tolerance: a step that increases the largest
-    residual, or leaves the domain of a logarithm or a root, is shortened. Derivatives are those of
-    the result, by the implicit function theorem, so that the loss, the time derivative and the
-    estimated error of a network are those of one function.
-
-    Where no such state is found, as early in a training, the result is $\hat y$ itself. So the
-    network learns the solution there, until the layer can act. `fit` warns if any such state is
-    left at the end.
+    iteration of the projections of a solver, to their tolerance. Derivatives are those of the
+    result, by the implicit function theorem. Where no such state is found, as early in a training,
+    the result is $\hat y$ itself; `fit` warns if any such state is left at the end.
 
     !!! example
 
