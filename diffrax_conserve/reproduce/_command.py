@@ -31,14 +31,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     # The references need float64, and drifts are compared with its roundoff.
     jax.config.update("jax_enable_x64", True)
-    if options.command == "compare":
-        return _compare(parser, options)
-    if not options.train and (options.seed is not None or options.epochs is not None):
-        parser.error("--seed and --epochs are options of --train: give --train too")
-    if options.epochs is not None and options.epochs < 1:
-        parser.error(f"--epochs must be positive, but is {options.epochs}")
     system = systems.get(options.name)
     try:
+        if options.command == "compare":
+            verdict(system, options)
+            return 0
+        if not options.train and (options.seed is not None or options.epochs is not None):
+            raise SetupError("--seed and --epochs are options of --train: give --train too")
+        if options.epochs is not None and options.epochs < 1:
+            raise SetupError(f"--epochs must be positive, but is {options.epochs}")
         ok = _reproduce(
             system,
             options.out or Path("out", options.name),
@@ -51,24 +52,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SetupError as error:
         parser.error(str(error))
     return 0 if ok else 1
-
-
-def _compare(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    if options.tol is not None and options.dt is not None:
-        parser.error("--tol and --dt are adaptive steps and fixed ones: give one of them")
-    try:
-        verdict(
-            systems.get(options.name),
-            t1=options.t1,
-            dt=options.dt,
-            tol=options.tol,
-            starts=options.starts,
-            seed=options.seed,
-            out=options.out,
-        )
-    except SetupError as error:
-        parser.error(str(error))
-    return 0
 
 
 def run() -> int:
