@@ -24,7 +24,6 @@ from .._manifold import check_manifold, check_vector_field, slope_of
 from .._options import ONE_STATE, calling, check_counts, check_number, dtype_of
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
-from .._tree import tree_size
 from .check_invariance import entries_of
 from .compared_solves import Task, drifts, references, sizes_of, switched, timed
 from .comparison import (
@@ -48,8 +47,6 @@ _LEFT_OUT = 8
 _DENSE_STEPS = 4096
 # What is added to the name of a row with the metric by sizes, or by errors.
 _BY_SIZES, _BY_ERRORS = ", metric by sizes", ", metric by errors"
-# Linear invariants are searched for in states of at most so many components.
-_COMPONENTS = 300
 
 
 def compare(
@@ -166,11 +163,10 @@ def compare(
         eqx.filter_eval_shape(lambda y: slope_of(vector_field, start, y, args), first)
     entries = dict(entries_of(manifold))
     dense = any(getattr(entry, "rate", None) is not None for entry in entries.values())
-    steps = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
+    controller, saveat, ts, most = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
     task = Task(
         dfx.ODETerm(vector_field), args, y0s, start, jnp.asarray(t1, dtype),
-        None if dt0 is None else jnp.asarray(dt0, dtype), steps.controller, steps.saveat,
-        batch, steps.most,
+        None if dt0 is None else jnp.asarray(dt0, dtype), controller, saveat, batch, most,
     )  # fmt: skip
     if projection is None:
         projection = ManifoldProjection(solver, manifold).projection
@@ -180,7 +176,7 @@ def compare(
         reference = dfx.Kvaerno5() if implicit else dfx.Dopri8()
 
     variants = ft.partial(_variants, solver, manifold, projection, first)
-    report = _report(task, solver, variants, metrics, entries, reference, steps.ts)
+    report = _report(task, solver, variants, metrics, entries, reference, ts)
     print(report)
     return report
 
@@ -234,13 +230,8 @@ def _stacked(y0: Any, batch: bool) -> Any:
     return y0
 
 
-class _Steps(NamedTuple):
-    """The controller, what is saved, at which times, and the largest number of steps."""
-
-    controller: dfx.AbstractStepSizeController
-    saveat: dfx.SaveAt
-    ts: np.ndarray
-    most: int
+# The controller, what is saved, at which times, and the largest number of steps.
+_Steps = tuple[dfx.AbstractStepSizeController, dfx.SaveAt, np.ndarray, int]
 
 
 def _steps(
@@ -266,7 +257,7 @@ def _steps(
     ts = np.linspace(t0, t1, _TIMES + 1)
     most = min(max_steps, _DENSE_STEPS) if dense else max_steps
     controller = dfx.PIDController(rtol=float(rtol), atol=float(atol))
-    return _Steps(controller, dfx.SaveAt(ts=jnp.asarray(ts, dtype), dense=dense), ts, most)
+    return controller, dfx.SaveAt(ts=jnp.asarray(ts, dtype), dense=dense), ts, most
 
 
 def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
@@ -277,7 +268,7 @@ def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
     ts = np.minimum(t0 + np.append(np.arange(0, count, stride), count) * dt0, t1)
     saveat = dfx.SaveAt(t0=True, t1=True, steps=stride, dense=dense)
     # The sum of many steps may need another one, as long as roundoff.
-    return _Steps(dfx.ConstantStepSize(), saveat, ts, count + 1)
+    return dfx.ConstantStepSize(), saveat, ts, count + 1
 
 
 # ---- The variants ----
@@ -365,7 +356,8 @@ def _report(
     ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
     sizes = sizes_of(task, plain)
     exact, rough = references(task, reference, ts, sizes)
-    invariants = _invariants(task, ts, exact, sizes, entries)
+    field = task.term.vector_field
+    invariants = linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)
     states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
 
     counted = judged(states(plain), exact)
@@ -408,13 +400,3 @@ def _message(sols: dfx.Solution, success: np.ndarray) -> str:
     first = int(np.argmin(success))
     message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], sols.result)]
     return " ".join(message.split()).partition(". ")[0].rstrip(".")
-
-
-def _invariants(
-    task: Task, ts: np.ndarray, exact: Any, sizes: Any, entries: dict[str, Any]
-) -> np.ndarray:
-    """The linear invariants that nobody declared; none in a state that is too large."""
-    if tree_size(sizes) > _COMPONENTS:
-        return np.zeros((0, 0))
-    field = task.term.vector_field
-    return linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)
