@@ -253,9 +253,10 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
         jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
         loss=objective.problem.recipe.loss,
         typical=objective.typical,
+        fraction=epoch / objective.problem.recipe.epochs,
+        linear=objective.linear,
     )
-    fraction = epoch / objective.problem.recipe.epochs
-    vector, state, loss = optimiser.update(least_squares, vector, state, fraction, objective.linear)
+    vector, state, loss = optimiser.update(least_squares, vector, state)
     return restore(vector), state, loss
 
 
