@@ -79,20 +79,15 @@ _CHANGE = 0.2
 
 
 def refused_from_start(
-    flow_map: AbstractFlowMap,
-    known: tuple[Args, ...],
-    terms: dfx.AbstractTerm,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-    check_field: bool,
+    flow_map: AbstractFlowMap, known: tuple[Args, ...], check_field: bool, *given: Any
 ) -> Refused:
-    """Why no step of a solve can succeed, or zero. Not differentiated."""
+    """Why no step of a solve can succeed, or zero, `given` the arguments of the `init` of the
+    solver. Not differentiated."""
+    terms, t0, t1, y0, _ = given
     start, h = lax.stop_gradient(ravel_pytree(y0)[0]), jnp.asarray(t1 - t0)
     finite, another = tree_all_finite(start), jnp.asarray(False)
     if check_field:
-        change = increment(terms, t0, t1, y0, args)
+        change = increment(*given)
         slope = ravel_pytree(flow_map.slope(y0, *known))[0].astype(start.dtype)
         field = change(jnp.zeros_like(h), start) / h
         later = change(jnp.zeros_like(h), start + flow_map.max_step * field) / h

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
+from ..._custom_types import BoolScalarLike, RealScalarLike, Y
 from ..._options import found_in
 from ..._solver.diffrax_private import register, result_at
 from .chebyshev import series
@@ -95,17 +95,10 @@ def outcome(
     return lax.cond(inside, lambda: jtu.tree_map(jnp.asarray, step), other)
 
 
-def step_of(
-    solver: dfx.AbstractSolver,
-    nodes: int,
-    terms: PyTree[dfx.AbstractTerm],
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-) -> StepResult:
-    state = solver.init(terms, t0, t1, y0, args)
-    y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
+def step_of(solver: dfx.AbstractSolver, nodes: int, *given: Any) -> StepResult:
+    """A single step by a solver, `given` the terms, both times, the state and `args`."""
+    y1, error, dense_info, _, result = solver.step(*given, solver.init(*given), False)
+    _, t0, t1, _, _ = given
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
     dtype = jnp.result_type(t1 - t0)
     coefficients = series(lambda c: inner.evaluate(t0 + c * (t1 - t0)), nodes, dtype)
