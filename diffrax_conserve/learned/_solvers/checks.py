@@ -22,8 +22,8 @@ from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import in_field_time, is_backsolve
 from ..._tree import tree_all_finite, tree_shapes
 from .._networks.flow_map import AbstractFlowMap
+from .collocation import increment
 from .policies import StepResult
-from .sweeps import increment
 
 # An index into diffrax's results; zero is success.
 Refused = Int[Array, ""]

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from .chebyshev import chebyshev_points, to_coefficients
+from .collocation import chebyshev_points, to_coefficients
 
 # The length of the Legendre series, and of the Gauss rule that computes them.
 _DEGREES = 80

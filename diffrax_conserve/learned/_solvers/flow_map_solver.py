@@ -15,10 +15,17 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._hashable import Hashable
 from ..._projection.options import option
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
-from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import Refused, check_learned_terms, check_output, refused_from_start, with_result
+from .collocation import (
+    ChebyshevInterpolation,
+    Increment,
+    coefficients,
+    correct,
+    estimate,
+    fractions,
+    increment,
+)
 from .policies import Policy, StepResult, StepsOutside, as_policy, check_policy, outcome, step_of
-from .sweeps import Increment, correct, estimate, increment
 
 # The points of a step for sweeps and dense output.
 _NODES = 12

@@ -15,8 +15,8 @@ from ..._solver.terms import in_field_time
 from ..._tree import eps_of, tree_sub
 from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
-from .chebyshev import ChebyshevInterpolation, series
 from .checks import Refused, check_learned_terms, check_output
+from .collocation import ChebyshevInterpolation, series
 
 _OUTSIDE = register(
     "a step ends, or the solve starts, outside the interval that the PINN was trained for. Solve "

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from ..._custom_types import BoolScalarLike, RealScalarLike, Y
 from ..._options import found_in
 from ..._solver.diffrax_private import register, result_at
-from .chebyshev import series
+from .collocation import series
 
 _OUTSIDE = register(
     "a step starts outside the domain of the flow map. `diffrax_conserve.learned.steps_outside` "

@@ -24,9 +24,8 @@ from ..._numerics.iterate import Solved, iterate, keep_done, left_after_step
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
-from .chebyshev import ChebyshevInterpolation, multiply
+from .collocation import ChebyshevInterpolation, increment, multiply
 from .feature_basis import FeatureBasis, feature_basis
-from .sweeps import increment
 
 # With fewer features none is random; with more they cannot be distinguished in double precision.
 _FEWEST, _MOST = 3, 32

@@ -26,7 +26,7 @@ from .._networks.flat import flatten, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import Window
 from .._networks.trainable import AbstractTrainable, Points
-from .._solvers.sweeps import rk4_errors
+from .._solvers.collocation import rk4_errors
 from .objective import Problem
 
 

@@ -107,16 +107,9 @@ class Objective(eqx.Module):
     key: PRNGKeyArray
 
     def defects(
-        self,
-        weights: Any,
-        points: Points,
-        schedule: LayerSchedule | None,
-        *,
-        of_candidate: bool = False,
+        self, weights: Any, points: Points, schedule: LayerSchedule | None
     ) -> Float[Array, "points n"]:
         model, problem, rows = eqx.combine(weights, self.static), self.problem, []
-        if of_candidate and model.layer is not None:
-            model = eqx.tree_at(lambda model: model.layer, model, None)
         if problem.vector_field is not None:
             rows.append(problem.defects(model, points, schedule))
         if problem.data is not None:
@@ -240,16 +233,15 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     # would be singular: with all weights damped alike a pendulum took 1,240 epochs in place of 120,
     # for a hundred times the error. An accurate candidate is near the manifold, and its projection
     # as accurate; the best model is chosen, and measured, with the layer.
-    of_candidate = isinstance(optimiser, LevenbergMarquardt)
+    if isinstance(optimiser, LevenbergMarquardt) and objective.static.layer is not None:
+        objective = eqx.tree_at(lambda of: of.static.layer, objective, None)
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
-        return objective.defects(restore(vector), single, schedule, of_candidate=of_candidate)[0]
+        return objective.defects(restore(vector), single, schedule)[0]
 
     least_squares = LeastSquares(
-        defects=lambda v: objective.defects(
-            restore(v), points, schedule, of_candidate=of_candidate
-        ),
+        defects=lambda v: objective.defects(restore(v), points, schedule),
         jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
         loss=objective.problem.recipe.loss,
         typical=objective.typical,
