@@ -142,11 +142,7 @@ def compare(
             report = dfc.compare(
                 system.vector_field, dfc.RK4(), system.manifold, system.y0, t1=20.0, dt0=0.2
             )
-        print(report.choice)
-        ```
-
-        ```text
-        all kept
+        assert report.choice == "all kept"
         ```
     """
     if isinstance(vector_field, dfx.ODETerm):
