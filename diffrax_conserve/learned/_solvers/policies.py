@@ -97,8 +97,9 @@ def outcome(
 
 def step_of(solver: dfx.AbstractSolver, nodes: int, *given: Any) -> StepResult:
     """A single step by a solver, `given` the terms, both times, the state and `args`."""
-    y1, error, dense_info, _, result = solver.step(*given, solver.init(*given), False)
-    _, t0, t1, _, _ = given
+    terms, t0, t1, y0, args = given
+    state = solver.init(terms, t0, t1, y0, args)
+    y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
     dtype = jnp.result_type(t1 - t0)
     coefficients = series(lambda c: inner.evaluate(t0 + c * (t1 - t0)), nodes, dtype)
