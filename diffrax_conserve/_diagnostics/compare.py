@@ -86,9 +86,9 @@ def compare(
     trusted. From the time on at which both differ by more than a third of the smallest error, or
     every error is larger than 0.3, nothing is judged: so chaos is told.
 
-    Taken is the first projection of the table with at most 1.5 times the least error up to then, in
-    the geometric mean over a batch, if that is less than 0.9 times the error without projection. If
-    none is, the first is taken that has at most 1.1 times that error, also in each component, and
+    Taken is the first projection of the table whose error up to then, in the geometric mean over a
+    batch, is at most 1.5 times the least and less than 0.9 times that without projection. If there
+    is none, the first is taken that has at most 1.1 times that error, also in each component, and
     in no lane 1.5 times, and is said to be for what it keeps only; otherwise no projection is. What
     makes a component more than 3 times less accurate is told, and is taken only if the error falls
     to less than a third. If all entries kept spoil a component so, a metric by errors is tried too:

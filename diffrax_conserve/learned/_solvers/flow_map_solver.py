@@ -122,8 +122,8 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         check_learned_terms(terms, "DeepONetSolver")
         known = known_args(self.flow_map, args)
         check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
-        given = self.flow_map, known, self.check_field, terms, t0, t1, y0, args
-        refused = refused_from_start(*given)
+        given = terms, t0, t1, y0, args
+        refused = refused_from_start(self.flow_map, known, self.check_field, *given)
         return _State(refused, StepsOutside.zero(t0) if self._has_domain else None)
 
     def step(
