@@ -4,6 +4,7 @@ The defect `du/dt - f(t, u)` is computed at all points by one forward-mode pass.
 passes takes twice as long, and reverse mode six times as long.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
@@ -105,11 +106,14 @@ class Objective(eqx.Module):
     typical: Float[Array, ""]
     linear: Bool[Array, " weights"]  # marks those of the last layer
     key: PRNGKeyArray
+    of_candidate: bool = eqx.field(static=True, default=False)  # leave the layer out of defects
 
     def defects(
         self, weights: Any, points: Points, schedule: LayerSchedule | None
     ) -> Float[Array, "points n"]:
         model, problem, rows = eqx.combine(weights, self.static), self.problem, []
+        if self.of_candidate and model.layer is not None:
+            model = eqx.tree_at(lambda model: model.layer, model, None)
         if problem.vector_field is not None:
             rows.append(problem.defects(model, points, schedule))
         if problem.data is not None:
@@ -233,8 +237,8 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     # would be singular: with all weights damped alike a pendulum took 1,240 epochs in place of 120,
     # for a hundred times the error. An accurate candidate is near the manifold, and its projection
     # as accurate; the best model is chosen, and measured, with the layer.
-    if isinstance(optimiser, LevenbergMarquardt) and objective.static.layer is not None:
-        objective = eqx.tree_at(lambda of: of.static.layer, objective, None)
+    of_candidate = isinstance(optimiser, LevenbergMarquardt)
+    objective = dataclasses.replace(objective, of_candidate=of_candidate)
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
