@@ -203,13 +203,13 @@ def compare(
         shown = count if np.median(found) <= goal else 0
         rows.append((name, shown, np.median(found), np.quantile(found, 0.99), *times))
     names, *numbers = zip(*rows, strict=True)
-    columns: Any = map(np.array, numbers)  # in the order of the fields
     inside = eqx.filter_jit(jax.vmap(lambda y: flow_map.inside(y, *known, h)))(states)
     args_error, wrong = np.nan, np.nan
     if args_domain_of(flow_map) is not None:
         args_error, wrong = _derivatives(flow_map, term, states, h, args)
     outside = int(jnp.sum(~inside))
-    comparison = Comparison(names, *columns, outside, inside.size, args_error, wrong)
+    found: Any = *map(np.array, numbers), outside, inside.size, args_error, wrong
+    comparison = Comparison(names, *found)
     print(comparison)
     return comparison
 
