@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -21,7 +20,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import check_manifold, check_vector_field, slope_of
-from .._options import ONE_STATE, calling, check_counts, check_number, dtype_of
+from .._options import ONE_STATE, calling, check_counts, check_float64, check_number, dtype_of
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
 from .check_invariance import entries_of
@@ -150,7 +149,7 @@ def compare(
     check_vector_field(vector_field)
     check_manifold(manifold)
     _check_solvers(solver, reference)
-    _check_float64()
+    check_float64("compare")
     y0s = _stacked(y0, batch)
     first = jtu.tree_map(lambda x: x[0], y0s)
     dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0s))).dtype
@@ -195,15 +194,6 @@ def _check_solvers(solver: Any, reference: Any) -> None:
         raise TypeError(
             f"`reference` is {reference!r}, but it must be a diffrax solver with error estimates, "
             "such as `diffrax.Dopri8()`, or `None`."
-        )
-
-
-def _check_float64() -> None:
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise RuntimeError(
-            "`compare` needs float64 for the solve that it judges by. Set the environment variable "
-            "`JAX_ENABLE_X64=1`, or call `jax.config.update('jax_enable_x64', True)` before any "
-            "array is made. States in float32 may stay so."
         )
 
 
