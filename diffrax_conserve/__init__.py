@@ -57,10 +57,10 @@ from ._solver.statistics import statistics as statistics
 from ._solver.unrolled import RK4 as RK4
 from ._solver.unrolled import Unrolled as Unrolled
 from .learned._files import load as load
+from .learned._files import load_pretrained as load_pretrained
 from .learned._files import save as save
 from .learned._networks.deeponet import DeepONet as DeepONet
 from .learned._networks.pinn import PINN as PINN
-from .learned._pretrained import load_pretrained as load_pretrained
 from .learned._solvers.flow_map_solver import DeepONetSolver as DeepONetSolver
 from .learned._solvers.pinn_solver import PINNSolver as PINNSolver
 from .learned._solvers.random_features import RandomFeatureSolver as RandomFeatureSolver

@@ -65,6 +65,15 @@ def check_counts(**counts: Any) -> None:
             raise ValueError(f"`{name}` is {value}, but it must be a positive integer.")
 
 
+def check_float64(user: str) -> None:
+    """Raises unless JAX has float64, which `user` needs for the solve that it judges by."""
+    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
+        raise RuntimeError(
+            f"`{user}` needs float64. Set the environment variable `JAX_ENABLE_X64=1`, or call "
+            "`jax.config.update('jax_enable_x64', True)` before any array is made."
+        )
+
+
 def check_function(name: str, fn: Any, call: str, returns: str) -> None:
     """Raises unless `fn` takes as many arguments as `call`, such as `"fn(t, y, args)"`."""
     remedy = f"Pass a function `{call}` that returns {returns}."

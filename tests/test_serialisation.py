@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve.learned._files import read_info
-from diffrax_conserve.learned._pretrained import pretrained_path
+from diffrax_conserve.learned._files import pretrained_path, read_info
 
 from .learned import EAST, RADIUS, SAVED, SMALL, Still, saved, solution, states
 from .problems import oscillator

@@ -63,11 +63,6 @@ def bond_velocities(t, y, args):
     return jnp.sum(differences(y[0]) * differences(y[1]), -1)
 
 
-def chain_energy(t, y, args):
-    q, v = y
-    return jnp.sum(v * v) / 2 - jnp.sum(q @ GRAVITY)
-
-
 CHAIN = {"length": dfc.Constraint(bond_lengths), "velocity": dfc.Constraint(bond_velocities)}
 
 

@@ -51,7 +51,6 @@ def circulant(stencil):
 
 FIRST = circulant({-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}) / DX
 SECOND = circulant({-2: -1 / 12, -1: 4 / 3, 0: -5 / 2, 1: 4 / 3, 2: -1 / 12}) / DX**2
-FORWARD = circulant({0: -1, 1: 1}) / DX
 FLOW = -np.linalg.solve(np.eye(POINTS) - SECOND, FIRST)
 
 

@@ -175,7 +175,7 @@ def check_invariance(
         later = _measure(vector_field, manifold, ts + LATER, ys, args) if one_time else found
     entries = [
         _entry_of_report(name, entry, rtol, *map(np.asarray, measured))
-        for (name, entry), measured in zip(_entries(manifold), found, strict=True)
+        for (name, entry), measured in zip(entries_of(manifold), found, strict=True)
     ]
     for entry, (defect, violation, *_) in zip(entries, later, strict=True):
         # A state need not satisfy a moving constraint at another time. Such a one tells nothing.
@@ -210,8 +210,8 @@ def batch(
     return jnp.broadcast_to(t, shape), states
 
 
-def _entries(manifold: Manifold) -> list[tuple[str, Entry]]:
-    """The entries with their names in the report, such as `energy` for `manifold["energy"]`."""
+def entries_of(manifold: Manifold) -> list[tuple[str, Entry]]:
+    """The entries with their names in a report, such as `energy` for `manifold["energy"]`."""
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     return [(".".join(str(key_of(x)) for x in path) or "manifold", e) for path, e in flat]
 

@@ -13,18 +13,17 @@ from typing import Any, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike
-from .._manifold import check_manifold, check_vector_field, is_entry, slope_of
-from .._options import ONE_STATE, calling, check_counts, check_number, dtype_of
+from .._manifold import check_manifold, check_vector_field, slope_of
+from .._options import ONE_STATE, calling, check_counts, check_float64, check_number, dtype_of
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
-from .._tree import key_of, tree_size
+from .check_invariance import entries_of
 from .compared_solves import Task, drifts, references, sizes_of, switched, timed
 from .comparison import (
     NOTHING,
@@ -47,8 +46,6 @@ _LEFT_OUT = 8
 _DENSE_STEPS = 4096
 # What is added to the name of a row with the metric by sizes, or by errors.
 _BY_SIZES, _BY_ERRORS = ", metric by sizes", ", metric by errors"
-# Linear invariants are searched for in states of at most so many components.
-_COMPONENTS = 300
 
 
 def compare(
@@ -88,22 +85,18 @@ def compare(
     trusted. From the time on at which both differ by more than a third of the smallest error, or
     every error is larger than 0.3, nothing is judged: so chaos is told.
 
-    What to take is the projection with the least error up to then, in the geometric mean over a
-    batch, unless one before it in the table has at most 1.5 times this error: then the first of
-    these, because errors grow faster where less is kept. Only what has an error of less than 0.9
-    times that without projection gains. If nothing does, the first is taken that has at most 1.1
-    times that error, also in each component, and in no lane 1.5 times, and is said to be for what
-    it keeps only; otherwise no projection is. What makes a component more than 3 times less
-    accurate is told, and is taken only if the error falls to less than a third. If all entries kept
-    spoil a component so, as those of a solar system the outer planets beside Mercury, a metric by
-    errors is tried too: the weight of a component is the inverse square of its error without
-    projection, so that what is accurate already is hardly moved. Of more than eight entries none is
-    left out.
+    Taken is the first projection of the table whose error up to then, in the geometric mean over a
+    batch, is at most 1.5 times the least and less than 0.9 times that without projection. If there
+    is none, the first is taken that has at most 1.1 times that error, also in each component, and
+    in no lane 1.5 times, and is said to be for what it keeps only; otherwise no projection is. What
+    makes a component more than 3 times less accurate is told, and is taken only if the error falls
+    to less than a third. If all entries kept spoil a component so, a metric by errors is tried too:
+    the weight of a component is the inverse square of its error without projection. Of more than
+    eight entries none is left out.
 
-    A small system takes half a minute, most of it compilation. Lists that differ in what is left
-    out, and metrics of weights, share programs: so the time of a solve contains the evaluation of
-    the entry that is left out. A linear invariant that nobody declared is a combination of
-    components, of at most 300, that the field conserves at states near the solution.
+    A small system takes half a minute, most of it compilation. The time of a solve contains the
+    evaluation of the entry that is left out. A linear invariant that nobody declared is a
+    combination of components, of at most 300, that the field conserves at states near the solution.
 
     **Arguments:**
 
@@ -148,11 +141,7 @@ def compare(
             report = dfc.compare(
                 system.vector_field, dfc.RK4(), system.manifold, system.y0, t1=20.0, dt0=0.2
             )
-        print(report.choice)
-        ```
-
-        ```text
-        all kept
+        assert report.choice == "all kept"
         ```
     """
     if isinstance(vector_field, dfx.ODETerm):
@@ -160,20 +149,19 @@ def compare(
     check_vector_field(vector_field)
     check_manifold(manifold)
     _check_solvers(solver, reference)
-    _check_float64()
+    check_float64("compare")
     y0s = _stacked(y0, batch)
     first = jtu.tree_map(lambda x: x[0], y0s)
     dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0s))).dtype
     start = jnp.asarray(t0, dtype)
     with calling("`vector_field`", "vector_field(t, y, args)", t0, first, args):
         eqx.filter_eval_shape(lambda y: slope_of(vector_field, start, y, args), first)
-    entries = entries_of(manifold)
+    entries = dict(entries_of(manifold))
     dense = any(getattr(entry, "rate", None) is not None for entry in entries.values())
-    steps = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
+    controller, saveat, ts, most = _steps(t0, t1, dt0, rtol, atol, max_steps, dense, dtype)
     task = Task(
         dfx.ODETerm(vector_field), args, y0s, start, jnp.asarray(t1, dtype),
-        None if dt0 is None else jnp.asarray(dt0, dtype), steps.controller, steps.saveat,
-        batch, steps.most,
+        None if dt0 is None else jnp.asarray(dt0, dtype), controller, saveat, batch, most,
     )  # fmt: skip
     if projection is None:
         projection = ManifoldProjection(solver, manifold).projection
@@ -183,7 +171,7 @@ def compare(
         reference = dfx.Kvaerno5() if implicit else dfx.Dopri8()
 
     variants = ft.partial(_variants, solver, manifold, projection, first)
-    report = _report(task, solver, variants, metrics, entries, reference, steps.ts)
+    report = _report(task, solver, variants, metrics, entries, reference, ts)
     print(report)
     return report
 
@@ -209,15 +197,6 @@ def _check_solvers(solver: Any, reference: Any) -> None:
         )
 
 
-def _check_float64() -> None:
-    if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise RuntimeError(
-            "`compare` needs float64 for the solve that it judges by. Set the environment variable "
-            "`JAX_ENABLE_X64=1`, or call `jax.config.update('jax_enable_x64', True)` before any "
-            "array is made. States in float32 may stay so."
-        )
-
-
 def _stacked(y0: Any, batch: bool) -> Any:
     """The states with a leading axis. Raises unless they are floating-point arrays of one dtype."""
     leaves = jtu.tree_leaves(y0)
@@ -237,13 +216,8 @@ def _stacked(y0: Any, batch: bool) -> Any:
     return y0
 
 
-class _Steps(NamedTuple):
-    """The controller, what is saved, at which times, and the largest number of steps."""
-
-    controller: dfx.AbstractStepSizeController
-    saveat: dfx.SaveAt
-    ts: np.ndarray
-    most: int
+# The controller, what is saved, at which times, and the largest number of steps.
+_Steps = tuple[dfx.AbstractStepSizeController, dfx.SaveAt, np.ndarray, int]
 
 
 def _steps(
@@ -269,7 +243,7 @@ def _steps(
     ts = np.linspace(t0, t1, _TIMES + 1)
     most = min(max_steps, _DENSE_STEPS) if dense else max_steps
     controller = dfx.PIDController(rtol=float(rtol), atol=float(atol))
-    return _Steps(controller, dfx.SaveAt(ts=jnp.asarray(ts, dtype), dense=dense), ts, most)
+    return controller, dfx.SaveAt(ts=jnp.asarray(ts, dtype), dense=dense), ts, most
 
 
 def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
@@ -280,16 +254,10 @@ def _fixed(t0: float, t1: float, dt0: float, dense: bool) -> _Steps:
     ts = np.minimum(t0 + np.append(np.arange(0, count, stride), count) * dt0, t1)
     saveat = dfx.SaveAt(t0=True, t1=True, steps=stride, dense=dense)
     # The sum of many steps may need another one, as long as roundoff.
-    return _Steps(dfx.ConstantStepSize(), saveat, ts, count + 1)
+    return dfx.ConstantStepSize(), saveat, ts, count + 1
 
 
 # ---- The variants ----
-
-
-def entries_of(manifold: Manifold) -> dict[str, Any]:
-    """The entries by name, such as `energy` for `manifold["energy"]`."""
-    flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
-    return {".".join(str(key_of(x)) for x in path) or "manifold": entry for path, entry in flat}
 
 
 class _Variant(NamedTuple):
@@ -310,7 +278,7 @@ def _variants(
     metrics: dict[str, Any],
 ) -> list[_Variant]:
     """The solvers with projections. Without metrics all entries are kept only."""
-    entries, found = entries_of(manifold), []
+    entries, found = dict(entries_of(manifold)), []
     leave_out = metrics and 1 < len(entries) <= _LEFT_OUT
     changed = {name: dataclasses.replace(projection, metric=x) for name, x in metrics.items()}
     for left_out in (None, *(entries if leave_out else ())):
@@ -374,7 +342,8 @@ def _report(
     ts = np.where(np.isfinite(known), known, ts)  # sums of steps, with their roundoff
     sizes = sizes_of(task, plain)
     exact, rough = references(task, reference, ts, sizes)
-    invariants = _invariants(task, ts, exact, sizes, entries)
+    field = task.term.vector_field
+    invariants = linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)
     states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
 
     counted = judged(states(plain), exact)
@@ -417,13 +386,3 @@ def _message(sols: dfx.Solution, success: np.ndarray) -> str:
     first = int(np.argmin(success))
     message = dfx.RESULTS[jtu.tree_map(lambda x: x[first], sols.result)]
     return " ".join(message.split()).partition(". ")[0].rstrip(".")
-
-
-def _invariants(
-    task: Task, ts: np.ndarray, exact: Any, sizes: Any, entries: dict[str, Any]
-) -> np.ndarray:
-    """The linear invariants that nobody declared; none in a state that is too large."""
-    if tree_size(sizes) > _COMPONENTS:
-        return np.zeros((0, 0))
-    field = task.term.vector_field
-    return linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)

@@ -6,6 +6,7 @@ verdict depends on units, nor on how a state is packed into leaves.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import diffrax as dfx
@@ -353,15 +354,11 @@ class ComparisonReport:
         ]
 
     def _units(self) -> list[str]:
-        handed = "is `report.solver.projection.metric`"
-        about = {
-            "metric=1.0": "depends on the units of the state",
-            "metric by sizes": handed,
-            "metric by errors": handed,
-        }
-        return [
-            f"`{name}` {words}." for name, words in about.items() if name in (self.choice or "")
-        ]
+        choice = self.choice or ""
+        if "metric=1.0" in choice:
+            return ["`metric=1.0` depends on the units of the state."]
+        by = [name for name in ("metric by sizes", "metric by errors") if name in choice]
+        return [f"`{name}` is `report.solver.projection.metric`." for name in by]
 
     def __str__(self) -> str:
         lanes = self.doubt.shape[0]
@@ -382,13 +379,10 @@ class ComparisonReport:
         else:
             judged = self.last > 0
             worse = np.mean(error[i, judged] > first[judged]) if judged.any() else np.nan
-            found = [
-                _number(_median(error[i])),
-                _number(_worst(error[i])),
-                f"{worse:.0%}" if i else "",
-            ]
-        found += [_number(_worst(x)) for x in row.drift.values()]
-        found += [_number(_worst(row.linear))] * (self.num_linear > 0)
+            found = [_number(_of_known(of, error[i])) for of in (np.median, np.max)]
+            found.append(f"{worse:.0%}" if i else "")
+        largest = [*row.drift.values(), *([row.linear] if self.num_linear else [])]
+        found += [_number(_of_known(np.max, x)) for x in largest]
         return [*found, f"{np.median(row.steps):.0f}", _duration(row.seconds)]
 
     def plot(self, ax: Any = None) -> Any:
@@ -430,10 +424,15 @@ def _running(errors: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(errors, axis=1)
 
 
+def _of_known(function: Callable[[np.ndarray], Any], x: np.ndarray) -> float:
+    """The function of the elements that are not NaN, or NaN if there is none."""
+    known = x[~np.isnan(x)]
+    return float(function(known)) if known.size else np.nan
+
+
 def _mean(errors: np.ndarray) -> float:
-    """The geometric mean: infinite if one is, NaN if there is none."""
-    known = errors[~np.isnan(errors)]
-    return float(np.exp(np.mean(np.log(known)))) if known.size else np.nan
+    """The geometric mean, infinite if an error is."""
+    return _of_known(lambda x: np.exp(np.mean(np.log(x))), errors)
 
 
 def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
@@ -473,16 +472,6 @@ def _compared(ratios: np.ndarray) -> str:
     found += f", and {np.max(ratios):.2g} times at worst"
     larger = int(np.sum(ratios > 1))
     return found + f"; in {larger} of them it is larger" if larger else found
-
-
-def _median(x: np.ndarray) -> float:
-    known = x[~np.isnan(x)]
-    return float(np.median(known)) if known.size else np.nan
-
-
-def _worst(x: np.ndarray) -> float:
-    known = x[~np.isnan(x)]
-    return float(np.max(known)) if known.size else np.nan
 
 
 def _number(x: float) -> str:

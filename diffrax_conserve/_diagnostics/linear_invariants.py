@@ -16,8 +16,10 @@ from jaxtyping import Array, Float
 from .._custom_types import Args
 from .._manifold import slope_of
 from .._numerics.metric import broadcast_option
-from .._tree import ravel, unravel
+from .._tree import ravel, tree_size, unravel
 
+# With more components than these none is searched for.
+_COMPONENTS = 300
 # Slopes are taken at so many states for each component, and moved by this share of the size of the
 # component: states of one trajectory may lie in a plane that the field leaves elsewhere.
 _STATES, _BESIDE = 3, 1e-2
@@ -35,6 +37,8 @@ def linear_invariants(
     `ys` has leading axes over lanes and times. Rows are combinations of components in units of
     their `sizes`.
     """
+    if tree_size(sizes) > _COMPONENTS:
+        return np.zeros((0, 0))
     like = jtu.tree_map(lambda y: y[0, 0], ys)
     units = np.asarray(broadcast_option("sizes", sizes, like))
     times, states = _states(ts, ys, units)

@@ -82,24 +82,19 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
     $$v_{n+1} = v_{n+1/2} + \tfrac{h}{2} m^{-1} (F(q_{n+1}) + G(q_{n+1})^\top \mu_n), \quad
     \tfrac{d}{dt} g = G(q_{n+1}) v_{n+1} = 0.$$
 
-    The first multiplier is that of SHAKE. The matrix $G m^{-1} G^\top$ is factored once in a step,
-    at its end: that gives the velocities there, and the positions of the next step, by an iteration
-    that only evaluates $g$. The force is evaluated once in a step. The energy has no drift as long
-    as the steps are short enough for the forces.
+    The first multiplier is that of SHAKE. The matrix $G m^{-1} G^\top$ is factored, and the force
+    evaluated, once in a step. The energy has no drift as long as the steps are short enough for the
+    forces. See [Long runs][long-runs-rattle].
 
     The terms are those of `diffrax.SemiImplicitEuler`: for the state `(q, v)` the pair of
     `ODETerm(lambda t, v, args: v)` and `ODETerm(lambda t, q, args: force(q) / masses)`. The second
     is the acceleration: a force in its place is a solve with other masses, which no check can tell.
     With momenta $p$ in the place of $v$, the terms are $p/m$ and $F$, and `masses` is 1.
 
-    The constraints are functions of the positions alone, and those on the velocities follow: do not
-    pass the constraint of [`diffrax_conserve.tangent`][], which takes `(q, v)`.
-
     Steps are fixed. A state at a saved time comes from a shorter step. Derivatives follow from the
-    implicit function theorem. Redundant constraints, such as of a closed loop, do no harm. A step
-    that fails is NaN, and the `diffrax.RESULTS` tells why, as with
-    [`diffrax_conserve.ManifoldProjection`][]; so does a start that is off the constraint, in the
-    positions or in the velocities, by more than the square root of roundoff.
+    implicit function theorem. A step that fails is NaN, and the `diffrax.RESULTS` tells why, as
+    with [`diffrax_conserve.ManifoldProjection`][]; so does a start that is off the constraint, in
+    the positions or in the velocities, by more than the square root of roundoff.
 
     !!! example
 

@@ -80,12 +80,11 @@ class SymmetricProjection(ForwardingSolver):
     then backwards in time, and you are where you began. [`diffrax_conserve.ManifoldProjection`][]
     projects at one end only, which destroys the symmetry. For long orbits of reversible systems.
 
-    The conserved values are those at the start of the solve. A state at a saved time comes from a
-    shorter step. Derivatives follow from the implicit function theorem. A step that fails is NaN,
-    and the `diffrax.RESULTS` tells why, as with `ManifoldProjection`, and
-    [`diffrax_conserve.statistics`][] has the number of iterations, each of which is one step of the
-    wrapped solver: about four. Steps are fixed, because a step size that follows an error estimate
-    is not symmetric. By default the metric is Euclidean: that of motion depends on the past.
+    A state at a saved time comes from a shorter step. Derivatives follow from the implicit function
+    theorem. A step that fails is NaN, and the `diffrax.RESULTS` tells why, as with
+    `ManifoldProjection`. [`diffrax_conserve.statistics`][] has the number of iterations, each of
+    which is one step of the wrapped solver: about four. Steps are fixed, because a step size that
+    follows an error estimate is not symmetric.
 
     The multipliers are the same at both ends of a step, so quantities with nearly parallel
     gradients, such as energy and angular momentum on an almost circular orbit, may not be met

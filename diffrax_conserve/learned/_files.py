@@ -130,20 +130,11 @@ def load(
         if body.read(1):
             raise ValueError("it has data after the last array")
         _check(model)
-        if taylor is not None and header.get("slope") is not None:
-            _check_same(
-                "The vector field of `taylor` is",
-                _slope(_unwrapped(model)),
-                header["slope"],
-                "the field, and its `args`,",
-            )
-        if layer is not None and header.get("gradients") is not None:
-            _check_same(
-                "The gradients of the functions of `layer` are",
-                _gradients(_unwrapped(model)),
-                header["gradients"],
-                "the manifold, and its `args`,",
-            )
+        network: Any = _unwrapped(model)
+        if taylor is not None and (slope := header.get("slope")) is not None:
+            _check_same("vector field of `taylor`", _slope(network), slope, "field")
+        if layer is not None and (gradients := header.get("gradients")) is not None:
+            _check_same("Jacobian of `layer`", _gradients(network), gradients, "manifold")
         return model
 
     model = _read(path, build)
@@ -156,6 +147,35 @@ def read_info(path: PathLike) -> dict[str, Any]:
     """What the file `path` says about its network, without building it: a dictionary of the `info`
     that was given to `save`, and the `network`. Raises as `load`."""
     return _read(path, lambda header, body: header)
+
+
+def pretrained_path(name: str) -> Path:
+    """The file of a network that comes with the package. Raises a `ValueError` for another name."""
+    folder = Path(__file__).parents[1] / "pretrained"
+    known = {file.stem: file for file in sorted(folder.glob("*.network"))}
+    if str(name) not in known:
+        raise ValueError(f"There is no pretrained network {name!r}. Known: {', '.join(known)}.")
+    return known[name]
+
+
+def load_pretrained(name: str) -> Network:
+    """A network that comes with the package; raises a `ValueError` with the names for another one.
+
+    For each of the paper's five systems there are `SYSTEM-standard` and, with a conservative layer,
+    `SYSTEM-conservative`, trained by the paper's recipe; and `SYSTEM`, small and trained by
+    [`diffrax_conserve.learned.second_order`][]. `kepler` is a flow map of orbits of eccentricities
+    up to 0.6 and semi-major axes from 0.8; `pollu` and `robertson` are flow maps of stiff
+    chemistry. The second line of each file, JSON, tells how it was made.
+
+    !!! example
+
+        ```python
+        import diffrax_conserve as dfc
+
+        dfc.load_pretrained("rigid-body")(1.0)
+        ```
+    """
+    return load(pretrained_path(name))
 
 
 def _read(path: PathLike, use: Callable[[Any, io.BytesIO], Any]) -> Any:
@@ -356,6 +376,6 @@ def _check_same(what: str, found: np.ndarray, saved: Any, remedy: str) -> None:
     same = found.shape == saved.shape
     if not same or not np.max(np.abs(found - saved)) <= 1e-3 * np.max(np.abs(saved)):
         raise _NotGiven(
-            f"{what} {found} at a state where the saved network has {saved}. Pass {remedy} for "
-            "which the network was trained."
+            f"The {what} is {found} at a state where the saved network has {saved}. "
+            f"Pass the {remedy}, and its `args`, for which the network was trained."
         )

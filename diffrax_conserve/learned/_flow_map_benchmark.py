@@ -202,18 +202,14 @@ def compare(
         times = [*times, *[np.nan] * (4 - len(times))]
         shown = count if np.median(found) <= goal else 0
         rows.append((name, shown, np.median(found), np.quantile(found, 0.99), *times))
-    names, *columns = zip(*rows, strict=True)
-    substeps, error, error_99, alone, batch, alone_projected, batch_projected = map(
-        np.array, columns
-    )
+    names, *numbers = zip(*rows, strict=True)
     inside = eqx.filter_jit(jax.vmap(lambda y: flow_map.inside(y, *known, h)))(states)
     args_error, wrong = np.nan, np.nan
     if args_domain_of(flow_map) is not None:
         args_error, wrong = _derivatives(flow_map, term, states, h, args)
-    comparison = Comparison(
-        names, substeps, error, error_99, alone, batch, alone_projected, batch_projected,
-        int(jnp.sum(~inside)), int(inside.size), args_error, wrong,
-    )  # fmt: skip
+    outside = int(jnp.sum(~inside))
+    found: Any = *map(np.array, numbers), outside, inside.size, args_error, wrong
+    comparison = Comparison(names, *found)
     print(comparison)
     return comparison
 

@@ -15,23 +15,6 @@ from ._job import reproduce as _reproduce
 from ._verdict import verdict
 
 _NAMES = (*systems.names(), *systems.names(stiff=True))
-_EXAMPLES = """examples:
-  diffrax-conserve list
-  diffrax-conserve reproduce kepler --out out/kepler
-  diffrax-conserve compare kepler
-"""
-_EXAMPLES_OF_LIST = """example:
-  diffrax-conserve list
-"""
-_EXAMPLES_OF_REPRODUCE = """examples:
-  diffrax-conserve reproduce kepler
-  diffrax-conserve reproduce kepler --t1 50 --dt 0.1 --out out/longer
-  diffrax-conserve reproduce rigid-body --train --epochs 500 --seed 1
-"""
-_EXAMPLES_OF_COMPARE = """examples:
-  diffrax-conserve compare lotka-volterra
-  diffrax-conserve compare rigid-body --tol 1e-6 --starts 8 --out out/verdict
-"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -48,14 +31,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     # The references need float64, and drifts are compared with its roundoff.
     jax.config.update("jax_enable_x64", True)
-    if options.command == "compare":
-        return _compare(parser, options)
-    if not options.train and (options.seed is not None or options.epochs is not None):
-        parser.error("--seed and --epochs are options of --train: give --train too")
-    if options.epochs is not None and options.epochs < 1:
-        parser.error(f"--epochs must be positive, but is {options.epochs}")
     system = systems.get(options.name)
     try:
+        if options.command == "compare":
+            verdict(system, options)
+            return 0
+        if not options.train and (options.seed is not None or options.epochs is not None):
+            raise SetupError("--seed and --epochs are options of --train: give --train too")
+        if options.epochs is not None and options.epochs < 1:
+            raise SetupError(f"--epochs must be positive, but is {options.epochs}")
         ok = _reproduce(
             system,
             options.out or Path("out", options.name),
@@ -68,24 +52,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SetupError as error:
         parser.error(str(error))
     return 0 if ok else 1
-
-
-def _compare(parser: argparse.ArgumentParser, options: argparse.Namespace) -> int:
-    if options.tol is not None and options.dt is not None:
-        parser.error("--tol and --dt are adaptive steps and fixed ones: give one of them")
-    try:
-        verdict(
-            systems.get(options.name),
-            t1=options.t1,
-            dt=options.dt,
-            tol=options.tol,
-            starts=options.starts,
-            seed=options.seed,
-            out=options.out,
-        )
-    except SetupError as error:
-        parser.error(str(error))
-    return 0
 
 
 def run() -> int:
@@ -105,11 +71,11 @@ def run() -> int:
 
 def _parser() -> argparse.ArgumentParser:
     title = "Conservative solves of the systems in the catalogue."
-    raw: Any = dict(formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser = argparse.ArgumentParser("diffrax-conserve", description=title, epilog=_EXAMPLES, **raw)
+    every = "list", "reproduce kepler --out out/kepler", "compare kepler"
+    parser = argparse.ArgumentParser("diffrax-conserve", description=title, **_examples(*every))
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    commands.add_parser("list", help="list the systems by name", epilog=_EXAMPLES_OF_LIST, **raw)
+    commands.add_parser("list", help="list the systems by name", **_examples("list"))
     reproduce = commands.add_parser(
         "reproduce",
         help="compare solvers of a system, plain and projected",
@@ -118,18 +84,12 @@ def _parser() -> argparse.ArgumentParser:
             "and for the paper's five systems learned solvers too. Prints a table of errors and\n"
             "drifts, and writes figures and metrics.json."
         ),
-        epilog=_EXAMPLES_OF_REPRODUCE,
-        **raw,
+        **_examples(
+            "reproduce kepler",
+            "reproduce kepler --t1 50 --dt 0.1 --out out/longer",
+            "reproduce rigid-body --train --epochs 500 --seed 1",
+        ),
     )
-    reproduce.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
-    reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
-    reproduce.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
-    reproduce.add_argument(
-        "--dt", type=float, metavar="H", help="length of a step, or of a saved one if stiff"
-    )
-    reproduce.add_argument("--train", action="store_true", help="train the networks again")
-    reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
-    reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
     compare = commands.add_parser(
         "compare",
         help="say whether a projection makes a solution of a system better",
@@ -138,11 +98,21 @@ def _parser() -> argparse.ArgumentParser:
             "them left out, in several metrics. Prints errors and drifts, and says what to take.\n"
             "The solver is RK4, with a tolerance Tsit5, and for stiff systems Kvaerno5."
         ),
-        epilog=_EXAMPLES_OF_COMPARE,
-        **raw,
+        **_examples(
+            "compare lotka-volterra",
+            "compare rigid-body --tol 1e-6 --starts 8 --out out/verdict",
+        ),
     )
-    compare.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
-    compare.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
+    for command in (reproduce, compare):
+        command.add_argument("name", metavar="NAME", choices=_NAMES, help="a system, see `list`")
+        command.add_argument("--t1", type=float, metavar="T", help="final time; the first is 0")
+    reproduce.add_argument("--out", type=Path, metavar="DIR", help="default: out/NAME")
+    reproduce.add_argument(
+        "--dt", type=float, metavar="H", help="length of a step, or of a saved one if stiff"
+    )
+    reproduce.add_argument("--train", action="store_true", help="train the networks again")
+    reproduce.add_argument("--seed", type=int, metavar="N", help="of --train (default: 0)")
+    reproduce.add_argument("--epochs", type=int, metavar="N", help="of --train (default: 5000)")
     compare.add_argument("--dt", type=float, metavar="H", help="length of fixed steps")
     compare.add_argument("--tol", type=float, metavar="X", help="tolerance of adaptive steps")
     compare.add_argument(
@@ -151,3 +121,9 @@ def _parser() -> argparse.ArgumentParser:
     compare.add_argument("--seed", type=int, metavar="N", default=0, help="of them (default: 0)")
     compare.add_argument("--out", type=Path, metavar="DIR", help="for a figure of the errors")
     return parser
+
+
+def _examples(*calls: str) -> dict[str, Any]:
+    """The options of a parser that shows these calls below its help."""
+    text = "\n".join(["examples:", *(f"  diffrax-conserve {call}" for call in calls)])
+    return dict(epilog=text, formatter_class=argparse.RawDescriptionHelpFormatter)

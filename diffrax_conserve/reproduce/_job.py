@@ -14,22 +14,19 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._solver.manifold_projection import ManifoldProjection
 from .._solver.unrolled import RK4
 from .._tree import tree_size
-from ..learned._files import save
 from ..learned._replace_file import replace_file
 from ..systems import AbstractSystem
 from ..systems._chemistry import AbstractChemistry
 from ._solve import reason, run, state_errors
 from ._tables import metrics, table
 from ._trained import (
-    KINDS,
     Learned,
-    history,
     initial_states,
     is_learned,
     learned_solvers,
     pretrained,
     projection_schedule,
-    train,
+    trained,
 )
 
 # The largest size of the states of all steps, which are kept in memory.
@@ -80,7 +77,7 @@ def reproduce(
     make_writable(out)
     networks: dict[str, Learned] = {}
     if is_learned(system):
-        networks = _train(system, out, seed, epochs) if anew else pretrained(system)
+        networks = trained(system, out, seed, epochs) if anew else pretrained(system)
     chosen = solvers(system, {kind: network for kind, (network, *_) in networks.items()})
     runs = {}
     for i, (name, solver) in enumerate(chosen.items(), start=1):
@@ -108,18 +105,6 @@ def reproduce(
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def _train(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:
-    """Trains the standard and the conservative network, and saves them beside the figures."""
-    networks: dict[str, Learned] = {}
-    for kind in KINDS:
-        print(f"Training the {kind} network: {epochs} epochs, seed {seed}")
-        network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
-        info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
-        save(out / f"{kind}.network", network, info=info)
-        networks[kind] = network, *history(log)
-    return networks
 
 
 # ---- Before the work starts ----

@@ -1,5 +1,6 @@
 """The learned solvers of the paper's five systems, newly trained or pretrained."""
 
+from pathlib import Path
 from typing import Any
 
 import diffrax as dfx
@@ -12,10 +13,9 @@ from jaxtyping import PRNGKeyArray
 from .._projection.newton import Newton
 from .._solver.manifold_projection import ManifoldProjection
 from ..learned import ConservativeLayer, FitLog, paper
-from ..learned._files import load, read_info
+from ..learned._files import load, pretrained_path, read_info, save
 from ..learned._networks.deeponet import DeepONet
 from ..learned._networks.pinn import PINN
-from ..learned._pretrained import pretrained_path
 from ..learned._solvers.flow_map_solver import DeepONetSolver
 from ..learned._solvers.pinn_solver import PINNSolver
 from ..learned._training.fit import fit
@@ -106,6 +106,18 @@ def train(
         recipe=paper.recipe(network, epochs=epochs, points=points),
         progress=progress,
     )
+
+
+def trained(system: AbstractSystem, out: Path, seed: int, epochs: int) -> dict[str, Learned]:
+    """Both networks, trained anew and saved in the folder `out`."""
+    networks: dict[str, Learned] = {}
+    for kind in KINDS:
+        print(f"Training the {kind} network: {epochs} epochs, seed {seed}")
+        network, log = train(system, kind, seed=seed, epochs=epochs, progress=True)
+        info = {"system": system.name, "kind": kind, "seed": seed, "epochs": epochs}
+        save(out / f"{kind}.network", network, info=info)
+        networks[kind] = network, *history(log)
+    return networks
 
 
 def history(log: FitLog, points: int = 250) -> tuple[np.ndarray, np.ndarray]:

@@ -10,11 +10,11 @@ from ._fluids import KortewegDeVries as KortewegDeVries
 from ._fluids import PointVortices as PointVortices
 from ._gravity import Kepler as Kepler
 from ._gravity import OuterSolarSystem as OuterSolarSystem
-from ._lotka_volterra import LotkaVolterra as LotkaVolterra
 from ._mechanism import Balance as Balance
 from ._mechanism import Mechanism as Mechanism
 from ._oscillators import HarmonicOscillator as HarmonicOscillator
 from ._oscillators import HenonHeiles as HenonHeiles
+from ._oscillators import LotkaVolterra as LotkaVolterra
 from ._oscillators import TodaLattice as TodaLattice
 from ._pendulums import CartesianPendulum as CartesianPendulum
 from ._pendulums import DoublePendulum as DoublePendulum

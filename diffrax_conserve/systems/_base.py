@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import diffrax as dfx
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -14,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, PRNGKeyArray, Real
 
 from .._custom_types import Args, RealScalarLike, Y
 from .._manifold import Constraint, FirstIntegral
+from .._options import check_float64
 
 if TYPE_CHECKING:
     # Type checkers do not know that this is a class variable.
@@ -141,11 +141,7 @@ class AbstractSystem(eqx.Module):
         `RuntimeError` unless `jax_enable_x64` is on; `ValueError` if `ts` is not one-dimensional or
         empty; at run time an error if `ts` decreases or starts before `t0`.
         """
-        if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-            raise RuntimeError(
-                "`reference` needs float64. Set the environment variable `JAX_ENABLE_X64=1`, or "
-                "call `jax.config.update('jax_enable_x64', True)` before any array is made."
-            )
+        check_float64("reference")
         ts = jnp.asarray(ts, jnp.float64)
         if ts.ndim != 1 or ts.size == 0:
             raise ValueError(

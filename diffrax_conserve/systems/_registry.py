@@ -6,8 +6,7 @@ from ._base import AbstractSystem
 from ._chemistry import AbstractChemistry, Pollu, Robertson
 from ._fluids import ConservativeLorenz, KortewegDeVries, PointVortices
 from ._gravity import Kepler, OuterSolarSystem
-from ._lotka_volterra import LotkaVolterra
-from ._oscillators import HarmonicOscillator, HenonHeiles, TodaLattice
+from ._oscillators import HarmonicOscillator, HenonHeiles, LotkaVolterra, TodaLattice
 from ._pendulums import CartesianPendulum, DoublePendulum
 from ._rigid_body import RigidBody, RigidBodyAttitude
 

@@ -17,9 +17,24 @@ from hypothesis import strategies as st
 import diffrax_conserve as dfc
 from diffrax_conserve.learned._networks.cores import Gated
 from diffrax_conserve.learned._training.data import as_data
-from diffrax_conserve.learned._training.second_order import _by_gram_matrix, _by_triangular_factor
+from diffrax_conserve.learned._training.objective import Problem, advance, start
+from diffrax_conserve.learned._training.second_order import (
+    METHODS,
+    _by_gram_matrix,
+    _by_triangular_factor,
+)
 
-from ..learned import EAST, LORENZ, SMALL, Scale, error_of_turning, flow_map, states, turning
+from ..learned import (
+    EAST,
+    LORENZ,
+    RADIUS,
+    SMALL,
+    Scale,
+    error_of_turning,
+    flow_map,
+    states,
+    turning,
+)
 from ..problems import oscillator, refused
 from ..thinned import some_of
 
@@ -64,6 +79,22 @@ def test_an_update_solves_the_damped_problem(method, damping):
     normal = matrix.T @ matrix + damping(r @ r, columns) * np.eye(3)
     update = np.linalg.solve(normal, -matrix.T @ r)
     np.testing.assert_allclose(trained.weights - model.weights, update, rtol=1e-8)
+
+
+@pytest.mark.parametrize("steps", [None, 2])
+@pytest.mark.parametrize("method", METHODS)
+def test_an_epoch_through_a_layer_returns_what_it_is_given(method, steps):
+    """In its shapes: to compile one takes twenty times as long as to trace it."""
+    layer = dfc.learned.ConservativeLayer(RADIUS, steps=steps)
+    recipe = dfc.learned.Recipe(epochs=3, points=4, optimiser=method)
+    problem, model = Problem(oscillator, None, None, None, recipe), turning(layer=layer).window(0)
+
+    def trained():
+        objective, before = start(problem, model, KEY)
+        return before, advance(objective, before, *map(jnp.asarray, (0, 2, True)))
+
+    before, after = eqx.filter_eval_shape(trained)
+    assert eqx.tree_equal(before, after)
 
 
 @pytest.mark.parametrize("shape", [(30, 7), (7, 30)])

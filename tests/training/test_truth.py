@@ -11,6 +11,8 @@ import optax
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve.learned._networks.trainable import Points
+from diffrax_conserve.learned._training.errors import warn_off_manifold
 
 from ..learned import EAST, LORENZ, error_of_turning, flow_map, turning
 from ..problems import oscillator, refused
@@ -116,6 +118,15 @@ def test_a_layer_that_cannot_be_kept_is_told():
     network = turning(layer=dfc.learned.ConservativeLayer(root))
     with pytest.raises(ValueError, match="values of the `layer` are not finite at 1 of 1 initial"):
         dfc.fit(network, oscillator, key=KEY)
+
+
+@pytest.mark.parametrize(("sign", "told"), [(-1, []), (1, ["At 1 of the collocation points"])])
+def test_points_off_the_manifold_are_told(sign, told, recwarn):
+    """Of any weights: on the circle there is a state everywhere, on an empty set nowhere."""
+    circle = dfc.Constraint(lambda t, y, args: jnp.sum(y**2) + sign)
+    network = turning(layer=dfc.learned.ConservativeLayer(circle)).window(0)
+    warn_off_manifold(network, Points(jnp.linspace(0, 3, 5), None))
+    assert [str(warning.message)[:30] for warning in recwarn] == told
 
 
 def test_a_training_without_an_update_is_an_error():

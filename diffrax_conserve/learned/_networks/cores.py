@@ -170,13 +170,7 @@ class Concatenated(AbstractCore):
 
 @final
 class Gated(AbstractCore):
-    """A network of both inputs, whose hidden layers interpolate between two encodings of them,
-    `z ← a * z̃ + b * (1 - z̃)` with the output `z̃` of the layer for `z`.
-
-    ??? cite "Reference"
-
-        S. Wang, Y. Teng and P. Perdikaris, SIAM J. Sci. Comput. 43 (2021).
-    """
+    """A network of both inputs, whose hidden layers interpolate between two encodings of them."""
 
     encoders: tuple[MLP, MLP]
     hidden: tuple[MLP, ...]

@@ -98,17 +98,13 @@ class Frame(eqx.Module):
         import jax.numpy as jnp
 
 
-        # A planar system that commutes with rotations.
-        def polar(y):
-            radius = jnp.linalg.norm(y)
-            across = jnp.array([-y[1], y[0]])
-            return dfc.learned.Frame(radius[None], jnp.stack([y, across], axis=1))
+        def polar(y):  # of a planar system that commutes with rotations
+            basis = jnp.array([[y[0], -y[1]], [y[1], y[0]]])
+            return dfc.learned.Frame(jnp.linalg.norm(y)[None], basis)
 
 
         states = jnp.array([[1.0, 0.0], [0.0, 1.5], [2.0, 0.0]])
         flow_map = dfc.DeepONet(states, 0.25, frame=polar, key=jax.random.key(0))
-        east, north = flow_map(jnp.array([1.0, 0.0]), 0.1), flow_map(jnp.array([0.0, 1.0]), 0.1)
-        assert jnp.allclose(jnp.array([-east[1], east[0]]), north)
         ```
 
     ??? cite "Reference"

@@ -1,6 +1,5 @@
 """What a network is given: states, which it takes and returns as vectors, and checks."""
 
-import functools as ft
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +8,7 @@ import jax.core
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree, Real, Shaped
+from jaxtyping import Array, ArrayLike, Float, PyTree, Shaped
 
 from ..._custom_types import Y
 from ..._options import ONE_STATE, check_number, is_real
@@ -21,12 +20,6 @@ def working_dtype(y: Y) -> jnp.dtype:
     with jax.numpy_dtype_promotion("standard"):
         dtype = jnp.result_type(*jtu.tree_leaves(y))
     return jnp.finfo(dtype).dtype if jnp.issubdtype(dtype, jnp.complexfloating) else dtype
-
-
-def tree_max(a: Y) -> Real[Array, ""]:
-    """The largest modulus in `a`."""
-    sizes = [jnp.max(jnp.abs(x), initial=0) for x in jtu.tree_leaves(a)]
-    return ft.reduce(jnp.maximum, [x.astype(working_dtype(a)) for x in sizes])
 
 
 def flatten(y: Y) -> Float[Array, " n"]:

@@ -3,7 +3,9 @@
 from typing import Any, final
 
 import equinox as eqx
+import jax.lax as lax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from ..._balance import refuse_rates
@@ -12,10 +14,9 @@ from ..._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from ..._manifold import check_manifold, conserved_values
 from ..._numerics.implicit import MultiplierSystem, implicit_solution
 from ..._numerics.iterate import Solved, damped_newton
-from ..._numerics.problem import Problem, problem_of
+from ..._numerics.problem import Problem, problem_of, relative_to_scale
 from ..._options import check_counts
 from ..._tree import ravel, unravel
-from .iterations import iterated
 from .trainable import LayerSchedule
 
 
@@ -25,14 +26,9 @@ class ConservativeLayer(eqx.Module):
 
     For the output $\hat y$ with the constraint Jacobian $G(\hat y)$ it solves $g(y) = 0$,
     $y = \hat y + G(\hat y)^\top \lambda$, for the multipliers $\lambda$, by the damped Newton
-    iteration of the projections of a solver, to their tolerance: a step that increases the largest
-    residual, or leaves the domain of a logarithm or a root, is shortened. Derivatives are those of
-    the result, by the implicit function theorem, so that the loss, the time derivative and the
-    estimated error of a network are those of one function.
-
-    Where no such state is found, as early in a training, the result is $\hat y$ itself. So the
-    network learns the solution there, until the layer can act. `fit` warns if any such state is
-    left at the end.
+    iteration of the projections of a solver, to their tolerance. Derivatives are those of the
+    result, by the implicit function theorem. Where no such state is found, as early in a training,
+    the result is $\hat y$ itself; `fit` warns if any such state is left at the end.
 
     !!! example
 
@@ -86,7 +82,7 @@ class ConservativeLayer(eqx.Module):
             y = jnp.where(projected.ok, projected.y, vector)
         else:
             radius = None if self.as_printed else jnp.linalg.norm(scale)
-            y = iterated(problem, vector, radius, self.steps, schedule)
+            y = _iterated(problem, vector, radius, self.steps, schedule)
         return unravel(y, candidate)
 
     def values(self, t0: RealScalarLike, y0: Y) -> Values:
@@ -114,6 +110,46 @@ def _damped_along(
     """The damped iteration along the gradients at the candidate."""
     del directions
     return damped_newton(problem, candidate, problem.gradients(candidate), max_steps=max_steps)
+
+
+def _iterated(
+    problem: Problem,
+    candidate: Float[Array, " n"],
+    radius: Float[Array, ""] | None,
+    steps: int,
+    schedule: LayerSchedule | None,
+) -> Float[Array, " n"]:
+    r"""`ŷ + G(ŷ)ᵀ λ` with `λ = (1 - s) λ_{p-1} + s λ_p`, where `schedule` is `(p, s)`; by default
+    `λ` after all `steps`. Iterations beyond the `p`-th are not computed.
+
+    Newton's method in `λ`, with rows scaled to norm one, a damping `μ = min(1e-2, |g|²)` that
+    vanishes with the residual relative to its scale, and moves of at most `radius`. Without one it
+    is the algorithm as printed: `G(y)` is `G(ŷ)`, and nothing is damped. Derivatives are those of
+    what is computed, iteration by iteration, also far from the manifold.
+    """
+    dtype = candidate.dtype
+    p, s = (jnp.asarray(steps), jnp.ones(())) if schedule is None else schedule
+    before, rows = problem.linearise(candidate)
+
+    def improve(multipliers: Array) -> Array:
+        y = candidate + rows.rmatvec(multipliers)
+        g, jacobian = problem.linearise(y)
+        if radius is None:
+            return multipliers - rows.gram(rows).solve(g)
+        ratio = relative_to_scale(g, problem.scale(jacobian, y))
+        damping = jnp.minimum(1e-2, jnp.sum(ratio * ratio))
+        damped = 1 + damping * jnp.eye(g.size, dtype=dtype)
+        gram = jtu.tree_map(lambda matrix: matrix * damped, jacobian.gram(rows))
+        change = gram.solve(g)
+        step = rows.rmatvec(change)
+        return multipliers - lax.rsqrt(1 + jnp.sum(step * step) / radius**2) * change
+
+    def iterate(carry: tuple[Array, Array], i: Array) -> tuple[tuple[Array, Array], None]:
+        return lax.cond(i < p, lambda c: (c[1], improve(c[1])), lambda c: c, carry), None
+
+    zeros = jnp.zeros_like(before)
+    (previous, last), _ = lax.scan(iterate, (zeros, zeros), jnp.arange(steps))
+    return candidate + rows.rmatvec(previous + s.astype(dtype) * (last - previous))
 
 
 ConservativeLayer.__init__.__doc__ = r"""**Arguments:**

@@ -26,25 +26,11 @@ class AbstractWrapper(AbstractFlowMap):
 
     flow_map: eqx.AbstractVar[AbstractFlowMap]
 
-    @property
-    def max_step(self) -> RealScalarLike:
-        return self.flow_map.max_step
-
-    @property
-    def order(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.flow_map.order
-
-    @property
-    def domain(self) -> Any:
-        return self.flow_map.domain
-
-    @property
-    def args_domain(self) -> Box | None:
-        return args_domain_of(self.flow_map)
-
-    @property
-    def layer(self) -> Any:
-        """`None`: an inner layer is applied inside."""
+    max_step = property(lambda self: self.flow_map.max_step)
+    order = property(lambda self: self.flow_map.order)  # pyright: ignore
+    domain = property(lambda self: self.flow_map.domain)
+    args_domain = property(lambda self: args_domain_of(self.flow_map))
+    layer = property(lambda self: None)  # an inner layer is applied inside
 
     def seen(self, y: Any) -> Any:
         """A state as the inner flow map sees it."""
@@ -259,13 +245,8 @@ class OfPairs(AbstractWrapper):
     def linear_weights(self) -> Any:
         return self.flow_map.linear_weights()
 
-    @property
-    def domain(self) -> None:
-        """`None`: `fit` does not extend the domain of a family."""
-
-    @property
-    def args_domain(self) -> None:
-        """`None`: `args` are part of the state."""
+    domain = property(lambda self: None)  # `fit` does not extend the domain of a family
+    args_domain = property(lambda self: None)  # they are part of the state
 
 
 def field_of_pairs(vector_field: Callable[..., Any], t: RealScalarLike, y: Any, args: None) -> Any:

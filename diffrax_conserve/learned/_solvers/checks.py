@@ -22,8 +22,8 @@ from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import in_field_time, is_backsolve
 from ..._tree import tree_all_finite, tree_shapes
 from .._networks.flow_map import AbstractFlowMap
+from .collocation import increment
 from .policies import StepResult
-from .sweeps import increment
 
 # An index into diffrax's results; zero is success.
 Refused = Int[Array, ""]
@@ -79,20 +79,15 @@ _CHANGE = 0.2
 
 
 def refused_from_start(
-    flow_map: AbstractFlowMap,
-    known: tuple[Args, ...],
-    terms: dfx.AbstractTerm,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-    check_field: bool,
+    flow_map: AbstractFlowMap, known: tuple[Args, ...], check_field: bool, *given: Any
 ) -> Refused:
-    """Why no step of a solve can succeed, or zero. Not differentiated."""
+    """Why no step of a solve can succeed, or zero, `given` the arguments of the `init` of the
+    solver. Not differentiated."""
+    terms, t0, t1, y0, _ = given
     start, h = lax.stop_gradient(ravel_pytree(y0)[0]), jnp.asarray(t1 - t0)
     finite, another = tree_all_finite(start), jnp.asarray(False)
     if check_field:
-        change = increment(terms, t0, t1, y0, args)
+        change = increment(*given)
         slope = ravel_pytree(flow_map.slope(y0, *known))[0].astype(start.dtype)
         field = change(jnp.zeros_like(h), start) / h
         later = change(jnp.zeros_like(h), start + flow_map.max_step * field) / h

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import legendre
 
-from .chebyshev import chebyshev_points, to_coefficients
+from .collocation import chebyshev_points, to_coefficients
 
 # The length of the Legendre series, and of the Gauss rule that computes them.
 _DEGREES = 80
@@ -40,11 +40,7 @@ class FeatureBasis(NamedTuple):
 @ft.cache
 def feature_basis(count: int) -> FeatureBasis:
     """The basis with `count` members for the solution and 1.5 times as many for its error."""
-    return tabulate(count, _directions(count + -(-count // 2)))
-
-
-def tabulate(count: int, members: Float[np.ndarray, "degrees wide"]) -> FeatureBasis:
-    """The tables of a basis with the given Legendre coefficients, in `2 s - 1`."""
+    members = _directions(count + -(-count // 2))
     integrated = legendre.legint(members, lbnd=-1, axis=0) / 2
     points, weights = legendre.leggauss(2 * count)
     slopes = legendre.legval(points, members).T

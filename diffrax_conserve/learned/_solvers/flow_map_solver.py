@@ -15,10 +15,17 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._hashable import Hashable
 from ..._projection.options import option
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
-from .chebyshev import ChebyshevInterpolation, coefficients, fractions
 from .checks import Refused, check_learned_terms, check_output, refused_from_start, with_result
+from .collocation import (
+    ChebyshevInterpolation,
+    Increment,
+    coefficients,
+    correct,
+    estimate,
+    fractions,
+    increment,
+)
 from .policies import Policy, StepResult, StepsOutside, as_policy, check_policy, outcome, step_of
-from .sweeps import Increment, correct, estimate, increment
 
 # The points of a step for sweeps and dense output.
 _NODES = 12
@@ -115,9 +122,8 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         check_learned_terms(terms, "DeepONetSolver")
         known = known_args(self.flow_map, args)
         check_output(self.flow_map, (y0, *known, t1 - t0), y0, "flow_map")
-        refused = refused_from_start(
-            self.flow_map, known, terms, t0, t1, y0, args, self.check_field
-        )
+        given = terms, t0, t1, y0, args
+        refused = refused_from_start(self.flow_map, known, self.check_field, *given)
         return _State(refused, StepsOutside.zero(t0) if self._has_domain else None)
 
     def step(

@@ -15,8 +15,8 @@ from ..._solver.terms import in_field_time
 from ..._tree import eps_of, tree_sub
 from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
-from .chebyshev import ChebyshevInterpolation, series
 from .checks import Refused, check_learned_terms, check_output
+from .collocation import ChebyshevInterpolation, series
 
 _OUTSIDE = register(
     "a step ends, or the solve starts, outside the interval that the PINN was trained for. Solve "
@@ -34,11 +34,11 @@ _NODES = 12
 class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
     r"""Follows a trained PINN: $y_{n+1} = u(t_{n+1})$.
 
-    The vector field is not evaluated. Steps may have any length; they determine where states are
-    saved, projected or tested for events. The solve must start on the network's solution,
-    $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. There is no error estimate,
-    so use fixed steps. Dense output is the polynomial through the states at 12 Chebyshev points of
-    the step. The derivative with respect to `y0` is zero.
+    The vector field is not evaluated. Steps are fixed, of any length; they determine where states
+    are saved, projected or tested for events. The solve must start on the network's solution,
+    $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. Dense output is the
+    polynomial through the states at 12 Chebyshev points of the step. The derivative with respect to
+    `y0` is zero.
 
     !!! example
 

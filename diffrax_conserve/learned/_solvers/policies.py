@@ -1,7 +1,7 @@
 """Policies for steps that a flow map cannot be trusted with."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, final
+from typing import Any, Literal, NamedTuple, final
 
 import diffrax as dfx
 import equinox as eqx
@@ -11,10 +11,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from ..._custom_types import Args, BoolScalarLike, RealScalarLike, Y
+from ..._custom_types import BoolScalarLike, RealScalarLike, Y
 from ..._options import found_in
 from ..._solver.diffrax_private import register, result_at
-from .chebyshev import series
+from .collocation import series
 
 _OUTSIDE = register(
     "a step starts outside the domain of the flow map. `diffrax_conserve.learned.steps_outside` "
@@ -49,34 +49,29 @@ class StepResult(eqx.Module):
 
 
 @final
-class _Count(eqx.Module):
-    """Counts such steps."""
+class _Word(eqx.Module):
+    """Such steps are counted, or the first fails. A module, because a string would be a leaf."""
+
+    word: Literal["count", "fail"] = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return "'count'"
+        return repr(self.word)
 
 
-@final
-class _Fail(eqx.Module):
-    """Fails at the first such step."""
-
-    def __repr__(self) -> str:
-        return "'fail'"
-
-
+_COUNT, _FAIL = _Word("count"), _Word("fail")
 # A solver takes the step itself.
-Policy = _Count | _Fail | dfx.AbstractSolver
+Policy = _Word | dfx.AbstractSolver
 
 
 def as_policy(policy: Any) -> Policy:
     """The policy with this name, or a solver; raises if it is neither."""
-    found = dict(count=_Count(), fail=_Fail()).get(policy) if isinstance(policy, str) else policy
+    found = dict(count=_COUNT, fail=_FAIL).get(policy) if isinstance(policy, str) else policy
     if not isinstance(found, Policy):
-        raise TypeError(f"`outside` is {policy!r}, but it must be {_CHOICES}.")
+        raise TypeError(
+            f"`outside` is {policy!r}, but it must be 'count', 'fail', or a solver: "
+            "`diffrax.Tsit5()`."
+        )
     return found
-
-
-_CHOICES = "'count', 'fail', or a solver: `diffrax.Tsit5()`"
 
 
 def outcome(
@@ -86,9 +81,9 @@ def outcome(
     take: Callable[[dfx.AbstractSolver], StepResult],
 ) -> StepResult:
     """The result of a step, given that of the flow map, and `take`, the same step by a solver."""
-    if isinstance(policy, _Count):
+    if policy == _COUNT:
         return step
-    if isinstance(policy, _Fail):
+    if isinstance(policy, _Word):
         # The error stays finite: a smaller step starts at the same state.
         result = dfx.RESULTS.where(inside, step.result, result_at(_OUTSIDE))
         return StepResult(step.y1, step.error, step.coefficients, result)
@@ -100,15 +95,9 @@ def outcome(
     return lax.cond(inside, lambda: jtu.tree_map(jnp.asarray, step), other)
 
 
-def step_of(
-    solver: dfx.AbstractSolver,
-    nodes: int,
-    terms: PyTree[dfx.AbstractTerm],
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-) -> StepResult:
+def step_of(solver: dfx.AbstractSolver, nodes: int, *given: Any) -> StepResult:
+    """A single step by a solver, `given` the terms, both times, the state and `args`."""
+    terms, t0, t1, y0, args = given
     state = solver.init(terms, t0, t1, y0, args)
     y1, error, dense_info, _, result = solver.step(terms, t0, t1, y0, args, state, False)
     inner = solver.interpolation_cls(t0=t0, t1=t1, **dense_info)
@@ -120,7 +109,7 @@ def step_of(
 
 
 def check_policy(policy: Policy, has_domain: bool) -> None:
-    if not has_domain and not isinstance(policy, _Count):
+    if not has_domain and policy != _COUNT:
         raise ValueError(
             f"`outside` is {policy!r}, but the flow map cannot tell: it has no `domain`. "
             "Give it `diffrax_conserve.learned.Box.around(states)`, with the states that it was "

@@ -28,9 +28,9 @@ from .._networks.trainable import Points, checked_part
 from .._networks.wrappers import OfPairs, field_of_pairs, pair
 from .._solvers.checks import check_output
 from .data import as_data, as_sampler
+from .loop import FitState
 from .objective import Problem, VectorField
 from .recipe import Recipe, second_order
-from .state import FitState
 
 # The derivative of a first integral, relative to its terms, is roundoff. Single precision has much
 # of it at rest, where these terms are small.
@@ -177,13 +177,13 @@ def _check_field(network: Any, problem: Problem, starts: Points) -> None:
         if isinstance(network, AbstractFlowMap):
             check_output(network, (y0, starts.ts[0]), y0, "model")
         check_output(lambda y: problem.field(starts.ts[0], y), (y0,), y0, "vector_field")
-    now = np.asarray(_rates(problem, starts.ts, starts.y0s))
+    now = np.asarray(_vectors(problem.field, starts.ts, starts.y0s))
     _check_finite("`vector_field` is", now, starts.y0s)
     if isinstance(network, AbstractFlowMap):
         size = np.max(np.abs(now))
         # Over hundreds of steps: a dose may be given late.
         for time in network.max_step * 0.618 * 1.618 ** np.arange(16):
-            later = np.asarray(_rates(problem, starts.ts + time, starts.y0s))
+            later = np.asarray(_vectors(problem.field, starts.ts + time, starts.y0s))
             change = np.max(np.abs(later - now))
             if not change <= 1e-3 * size:
                 raise ValueError(
@@ -207,8 +207,8 @@ def _check_layer(network: Any, problem: Problem, starts: Points) -> None:
     """Raises unless the conserved values are finite, and warns if the field does not conserve them,
     because then the network cannot become the solution."""
     layer = network.layer
-    values = stacked_vectors(_values(layer, starts))
-    _check_finite("The conserved values of the `layer` are", np.asarray(values), starts.y0s)
+    values = np.asarray(_vectors(layer.values, starts.ts, starts.y0s))
+    _check_finite("The conserved values of the `layer` are", values, starts.y0s)
     entries = {name: x for name, x in named_entries(layer.manifold) if isinstance(x, FirstIntegral)}
     if problem.vector_field is None or not entries:
         return
@@ -227,11 +227,6 @@ def _check_layer(network: Any, problem: Problem, starts: Points) -> None:
 
 
 @eqx.filter_jit
-def _values(layer: Any, starts: Points) -> Any:
-    return jax.vmap(layer.values)(starts.ts, starts.y0s)
-
-
-@eqx.filter_jit
 def _shortly_after(problem: Problem, starts: Points, length: Any) -> tuple[Array, Y]:
     """Times and states a little later. At rest itself any function of the velocity is constant."""
     few = jtu.tree_map(lambda x: x[:64], starts)
@@ -246,5 +241,5 @@ def _field_of(problem: Problem, t: Any, y: Y, args: Args) -> Y:
 
 
 @eqx.filter_jit
-def _rates(problem: Problem, ts: Array, y0s: Y) -> Array:
-    return stacked_vectors(jax.vmap(problem.field)(ts, y0s))
+def _vectors(function: Any, ts: Array, y0s: Y) -> Array:
+    return stacked_vectors(jax.vmap(function)(ts, y0s))

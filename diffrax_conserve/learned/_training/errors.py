@@ -26,7 +26,7 @@ from .._networks.flat import flatten, stacked_vectors
 from .._networks.flow_map import AbstractFlowMap
 from .._networks.pinn import Window
 from .._networks.trainable import AbstractTrainable, Points
-from .._solvers.sweeps import rk4_errors
+from .._solvers.collocation import rk4_errors
 from .objective import Problem
 
 
@@ -131,7 +131,7 @@ def _off_manifold(model: AbstractTrainable, points: Points) -> Float[Array, ""]:
 
     def off(y: Y, t: Array, t0: Array, y0: Y) -> Array:
         equations, vector = model.layer.problem(y, t, (t0, y0))
-        return ~equations.holds(vector)
+        return ~equations.is_on_manifold(vector)
 
     ys = model.states(points, ts, None)
     return jnp.mean(jax.vmap(off)(ys, ts, starts.ts, starts.y0s))

@@ -16,10 +16,9 @@ from .._networks.pinn import PINN
 from .._networks.wrappers import OfPairs
 from .checks import check_types, checked, checked_sharding
 from .errors import flow_map_error, warn_off_manifold
-from .loop import FitLog, Loop, Progress
+from .loop import FitLog, FitState, Loop, Progress
 from .objective import Carry, VectorField
 from .recipe import Recipe
-from .state import FitState
 from .windows import train_windows
 
 _Model = TypeVar("_Model", bound=eqx.Module)
@@ -58,10 +57,6 @@ def fit(
     often as the recipe's `retries` allow. If the whole solution misses the `target`, the windows
     are trained again, to smaller errors. A warning tells if the solution, or a step, is wrong.
 
-    A training that was stopped, also by a keyboard interrupt, can be continued with otherwise the
-    same arguments, or with a recipe of more epochs; the result is the same, bit for bit, as without
-    the stop, unless the optimiser depends on the number of epochs, as SPRING does.
-
     **Arguments:**
 
     - `model`: a [`diffrax_conserve.PINN`][], a [`diffrax_conserve.learned.AbstractFlowMap`][] such
@@ -82,8 +77,10 @@ def fit(
         [`diffrax_conserve.learned.second_order`][]`(model)`.
     - `manifold`: for a `PINN`, the manifold to which the ends of the windows are projected, with
         the conserved values at the initial state. Default: that of its layer.
-    - `state`: the `state` in the log of a training that is to be continued. That of a flow map can
-        be kept in a file, by `equinox.tree_serialise_leaves`.
+    - `state`: the `state` in the log of a training that was stopped, to continue it with otherwise
+        the same arguments, or a recipe of more epochs. The result is the same, bit for bit, as
+        without the stop, unless the optimiser depends on the number of epochs, as SPRING does. That
+        of a flow map [can be kept in a file][stop-go-on-keep].
     - `target`: for a flow map, the loss at which the training ends; default: none. For a `PINN`,
         the accepted error of its solution, relative to its largest component; default: windows are
         cut until it is about 1e-7 (1e-4 in single precision), and above 1e-4 the solution is wrong.

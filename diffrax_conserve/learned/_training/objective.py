@@ -4,6 +4,7 @@ The defect `du/dt - f(t, u)` is computed at all points by one forward-mode pass.
 passes takes twice as long, and reverse mode six times as long.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
 
@@ -105,17 +106,13 @@ class Objective(eqx.Module):
     typical: Float[Array, ""]
     linear: Bool[Array, " weights"]  # marks those of the last layer
     key: PRNGKeyArray
+    of_candidate: bool = eqx.field(static=True, default=False)  # leave the layer out of defects
 
     def defects(
-        self,
-        weights: Any,
-        points: Points,
-        schedule: LayerSchedule | None,
-        *,
-        of_candidate: bool = False,
+        self, weights: Any, points: Points, schedule: LayerSchedule | None
     ) -> Float[Array, "points n"]:
         model, problem, rows = eqx.combine(weights, self.static), self.problem, []
-        if of_candidate and model.layer is not None:
+        if self.of_candidate and model.layer is not None:
             model = eqx.tree_at(lambda model: model.layer, model, None)
         if problem.vector_field is not None:
             rows.append(problem.defects(model, points, schedule))
@@ -241,21 +238,21 @@ def _updated(objective: Objective, carry: Carry, epoch: Array) -> tuple[Any, Any
     # for a hundred times the error. An accurate candidate is near the manifold, and its projection
     # as accurate; the best model is chosen, and measured, with the layer.
     of_candidate = isinstance(optimiser, LevenbergMarquardt)
+    objective = dataclasses.replace(objective, of_candidate=of_candidate)
 
     def at_one(vector: Array, point: Points) -> Array:
         single = jtu.tree_map(lambda x: x[None], point)
-        return objective.defects(restore(vector), single, schedule, of_candidate=of_candidate)[0]
+        return objective.defects(restore(vector), single, schedule)[0]
 
     least_squares = LeastSquares(
-        defects=lambda v: objective.defects(
-            restore(v), points, schedule, of_candidate=of_candidate
-        ),
+        defects=lambda v: objective.defects(restore(v), points, schedule),
         jacobian=lambda v: jax.vmap(jax.jacrev(at_one), in_axes=(None, 0))(v, points),
         loss=objective.problem.recipe.loss,
         typical=objective.typical,
+        fraction=epoch / objective.problem.recipe.epochs,
+        linear=objective.linear,
     )
-    fraction = epoch / objective.problem.recipe.epochs
-    vector, state, loss = optimiser.update(least_squares, vector, state, fraction, objective.linear)
+    vector, state, loss = optimiser.update(least_squares, vector, state)
     return restore(vector), state, loss
 
 

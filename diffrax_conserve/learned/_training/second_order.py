@@ -39,6 +39,8 @@ class LeastSquares(NamedTuple):
     jacobian: Callable[[Float[Array, " weights"]], Float[Array, "points n weights"]]
     loss: Loss
     typical: Float[Array, ""]
+    fraction: RealScalarLike  # of the training that is done
+    linear: Bool[Array, " weights"]  # marks the weights of the last layer
 
     def rows(
         self, weights: Float[Array, " weights"]
@@ -81,14 +83,8 @@ class SPRING(eqx.Module):
         return SpringState(jnp.zeros_like(vector), jnp.asarray(jnp.inf, vector.dtype))
 
     def update(
-        self,
-        problem: LeastSquares,
-        weights: Float[Array, " weights"],
-        state: SpringState,
-        fraction: RealScalarLike,
-        linear: Bool[Array, " weights"],
+        self, problem: LeastSquares, weights: Float[Array, " weights"], state: SpringState
     ) -> tuple[Float[Array, " weights"], SpringState, Float[Array, ""]]:
-        del linear
         r, jacobian, loss = problem.rows(weights)
         running = jnp.where(jnp.isfinite(state.loss), 0.95 * state.loss + 0.05 * loss, loss)
         zeta = _MOMENTUM * state.update
@@ -97,7 +93,7 @@ class SPRING(eqx.Module):
             update = zeta - _by_gram_matrix(jacobian, target, damping)
         else:
             update = zeta - _by_triangular_factor(jacobian, target, damping)
-        length = jnp.asarray(_LENGTH(fraction), r.dtype)
+        length = jnp.asarray(_LENGTH(problem.fraction), r.dtype)
         return weights + length * update, SpringState(update, running), loss
 
 
@@ -158,16 +154,10 @@ class LevenbergMarquardt(eqx.Module):
         return jnp.asarray(self.damping, ravel_pytree(weights)[0].dtype)
 
     def update(
-        self,
-        problem: LeastSquares,
-        weights: Float[Array, " weights"],
-        state: Float[Array, ""],
-        fraction: RealScalarLike,
-        linear: Bool[Array, " weights"],
+        self, problem: LeastSquares, weights: Float[Array, " weights"], state: Float[Array, ""]
     ) -> tuple[Float[Array, " weights"], Float[Array, ""], Float[Array, ""]]:
-        del fraction
         r, jacobian, loss = problem.rows(weights)
-        units = jnp.where(linear, jnp.asarray(_FREEDOM, r.dtype), 1)
+        units = jnp.where(problem.linear, jnp.asarray(_FREEDOM, r.dtype), 1)
         damping = state * jnp.mean(jnp.sum(jnp.square(jacobian), axis=0))
         update = units * _damped_least_squares(jacobian * units, -r, damping)
         after = problem.loss(squared_norms(problem.defects(weights + update)), problem.typical)

@@ -24,8 +24,7 @@ from .._networks.flat import flatten
 from .._networks.pinn import PINN, Window
 from .._networks.trainable import Points
 from .errors import relative, roundoff, warn_off_manifold, window_errors
-from .loop import FitLog, Loop
-from .state import FitState
+from .loop import FitLog, FitState, Loop
 
 # Without a `target`: the error above which a solution is wrong, relative to its largest component,
 # and the one that is aimed at in double precision.
