@@ -206,8 +206,9 @@ class Problem(eqx.Module):
         sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
-        is_met = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
-        success = is_met if ok is None else ok
+        success = ok
+        if success is None:
+            success = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
         before, after = (jnp.max(x) for x in sizes)
         results = optx.RESULTS
         missed, diverged = results.nonlinear_max_steps_reached, results.nonlinear_divergence
