@@ -35,7 +35,7 @@ from .._options import check_counts, check_number
 from .._projection.options import check_state, option
 from .._solver.failure import failure_cause, masked_step, starts_off_manifold
 from .._solver.state import initial_values
-from .._solver.terms import in_field_time, is_backsolve, is_ode
+from .._solver.terms import in_field_time, is_backsolve, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
@@ -187,7 +187,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         args: Args,
     ) -> _State:
         del t1
-        if is_backsolve(terms) or not is_ode(terms):
+        if is_backsolve(terms) or len(vector_fields(terms)) < 2:
             raise ValueError(
                 "`RATTLE` solves ordinary differential equations forwards: its terms must be two "
                 "`diffrax.ODETerm`s, and `BacksolveAdjoint` has others. Use "

@@ -45,8 +45,11 @@ def refuse_backsolve(terms: PyTree[dfx.AbstractTerm], solver: str, remedy: str =
 
 
 def is_ode(terms: PyTree[dfx.AbstractTerm]) -> bool:
-    """Whether every term is a `diffrax.ODETerm`, whose control is time."""
-    return all(isinstance(x, (dfx.ODETerm, *_COMPOSED)) for x in _nested(terms))
+    """Whether time is the only control: every term is a `diffrax.ODETerm`, or one of the user's own
+    class that contains no path, as a `diffrax.ControlTerm` does."""
+    is_path = lambda x: isinstance(x, dfx.AbstractPath)  # noqa: E731
+    own = [x for x in _nested(terms) if not isinstance(x, (dfx.ODETerm, *_COMPOSED))]
+    return not any(map(is_path, jtu.tree_leaves(own, is_leaf=is_path)))
 
 
 def vector_fields(terms: PyTree[dfx.AbstractTerm]) -> list[Any]:

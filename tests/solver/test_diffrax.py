@@ -226,6 +226,56 @@ def sum_of_saved(y0):
     return jnp.sum(solve(rigid_body, solver, y0, t1=0.3, saveat=saveat).ys)
 
 
+class OwnTerm(dfx.AbstractTerm):
+    """A term of a user's class, as packages write them, that does what `part` does."""
+
+    part: dfx.AbstractTerm
+
+    def vf(self, t, y, args):
+        return self.part.vf(t, y, args)
+
+    def contr(self, t0, t1, **kwargs):
+        return self.part.contr(t0, t1, **kwargs)
+
+    def prod(self, vf, control):
+        return self.part.prod(vf, control)
+
+
+@pytest.mark.parametrize("keep_linear", [False, True])
+@pytest.mark.parametrize("solver", [dfx.Tsit5(), dfx.Kvaerno3()], ids=["Tsit5", "Kvaerno3"])
+def test_a_term_of_ones_own_class_changes_nothing(solver, keep_linear):
+    """The metric of motion, in which units do not matter and what never moves is not corrected,
+    belongs to the equation and not to the class of the term. Here the mass is part of the state."""
+
+    def field(t, y, args):
+        q, v, mass = y
+        return jnp.stack([v, -q / mass, 0.0 * mass])
+
+    energy = dfc.FirstIntegral(lambda t, y, args: (y[2] * y[1] ** 2 + y[0] ** 2) / 2)
+    kept = dfc.ManifoldProjection(solver, energy, keep_linear=keep_linear)
+    y0, controller = jnp.array([1.0, 0.0, 2.0]), dfx.PIDController(rtol=1e-2, atol=1e-2)
+
+    def end(term):
+        return dfx.diffeqsolve(term, kept, 0, 9, 0.5, y0, stepsize_controller=controller).ys[-1]
+
+    term = dfx.ODETerm(field)
+    np.testing.assert_array_equal(end(OwnTerm(term)), end(term))
+    np.testing.assert_allclose(end(term)[2], 2, rtol=1e-9)
+
+
+def test_a_stochastic_term_of_ones_own_class_changes_nothing():
+    """In the metric of motion, which depends on the path, it would converge to something else."""
+    noise = dfx.VirtualBrownianTree(0, 1, 1e-2, (), jax.random.key(0))
+    term = dfx.ControlTerm(lambda t, y, args: jnp.stack([100 * y[1], -y[0] / 100]), noise)
+    circle = dfc.FirstIntegral(lambda t, y, args: y[0] ** 2 + (100 * y[1]) ** 2)
+    kept = dfc.ManifoldProjection(dfx.Heun(), circle)
+    one, other = (
+        dfx.diffeqsolve(term, kept, 0, 1, 0.1, jnp.array([1.0, 0.0])).ys
+        for term in (term, OwnTerm(term))
+    )
+    np.testing.assert_array_equal(one, other)
+
+
 def test_strict_promotion_and_rank_promotion():
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
         assert jax.eval_shape(jax.grad(sum_of_saved), OMEGA0).shape == OMEGA0.shape
