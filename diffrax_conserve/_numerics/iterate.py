@@ -35,12 +35,13 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import (
     BACKTRACKING_FACTOR,
     FROZEN_STEPS,
+    MAX_BLOCK,
     MAX_UNROLLED,
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
 )
-from .._fast.scalars import joined, loop_in_scalars, with_batch_flag
-from .linear import permuted, pivot_order, roundoff_pivot_tolerance
+from .._fast.scalars import joined, loop_in_scalars, with_batch_flag, with_lanes_last
+from .linear import gram_inverse, permuted, pivot_order, roundoff_pivot_tolerance, transposed_product
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -82,7 +83,9 @@ class _LoopState(NamedTuple):
     num_iterations: Array
 
 
-def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
+def iterate(
+    advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] = ()
+) -> Solved:
     """Advances the unknowns until no test is left.
 
     `tests_left` is the number of tests that are left. The unknowns are tested before each step and
@@ -97,7 +100,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
         y, tests_left = advance(now.y, now.tests_left)
         return _LoopState(y, tests_left, now.num_iterations + (tests_left > 0).astype(int))
 
-    start = _LoopState(y, initial_tests(max_steps), jnp.asarray(0))
+    tests_left = jnp.broadcast_to(initial_tests(max_steps), lanes)
+    start = _LoopState(y, tests_left, jnp.zeros(lanes, int))
     end = lax.while_loop(lambda now: any_lane(now.tests_left > 0), body, start)
     return Solved(end.y, end.tests_left == 0, end.num_iterations)
 
@@ -141,7 +145,7 @@ def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
     array in the carry, which keeps the lanes that are done. With this condition, which is the same
     for all lanes, it adds none. A branch with such a condition remains a branch.
     """
-    return flag
+    return jnp.any(flag)
 
 
 @any_lane.def_vmap
@@ -168,6 +172,8 @@ def simplified_newton(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     For up to four constraints they are `directions` if these are given, and otherwise, after
     `FROZEN_STEPS` iterations, the gradients at the current state."""
+    if MAX_UNROLLED < problem.magnitude.size <= MAX_BLOCK:
+        return with_lanes_last(ft.partial(_in_lanes, max_steps=max_steps))(problem, candidate)
     if problem.magnitude.size > MAX_UNROLLED:
         return _with_frozen_jacobian(problem, candidate, max_steps)
     return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
@@ -265,6 +271,43 @@ def _with_frozen_jacobian(
 
     y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
     return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
+
+
+def _in_lanes(each: Any, candidate: Array, is_batched: bool, *, max_steps: int) -> Solved:
+    """`_with_frozen_jacobian` for up to `MAX_BLOCK` constraints. In a batch the lanes are the last
+    axis of all arrays here."""
+
+    def linearised(problem: Problem, y: Array) -> tuple[Array, Array, Array]:
+        jacobian = problem.linearise(y)[1]
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        return problem.scale(jacobian, y), row_scales, rows.matrix
+
+    def tested(problem: Problem, y: Array, scale: Array) -> tuple[Array, Array]:
+        return problem.level(problem.residual(y), scale)
+
+    candidate = lax.optimization_barrier(candidate)
+    scale, row_scales, rows = each(linearised)(candidate)
+    if is_batched:
+        solve = gram_inverse(rows)
+    else:
+        solve = DenseRows(rows).gram(DenseRows(rows)).factorise()
+
+    def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
+        level, to_correct = each(tested)(y, scale)
+        tests_left = left_after_test(level, tests_left)
+
+        def move() -> Array:
+            multiplier = solve(to_correct / row_scales)
+            change = transposed_product(multiplier, jnp.moveaxis(rows, 0, 1))
+            return y - each(lambda problem, x: problem.factor.to_state(x))(change)
+
+        moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
+        return keep_done(tests_left, moved, y), tests_left
+
+    y, ok, num_iterations, _ = iterate(
+        advance, candidate, max_steps=max_steps, lanes=candidate.shape[1:]
+    )
+    return Solved(y, ok & each(Problem.is_on_manifold)(y), num_iterations)
 
 
 # ---- For starts far away ----

@@ -1,6 +1,7 @@
 """The elimination of small matrices, LAPACK's factors of large ones, and iterative refinement."""
 
 import functools as ft
+import operator as op
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import NUM_REFINEMENTS, ROUNDOFF
+from .._constants import NUM_REFINEMENTS, REGULARISATION_POWER, ROUNDOFF
 from .._tree import eps_of
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -51,6 +52,39 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
         left = left - below[..., :, None] * left[..., k, None, :]
         matrix = matrix - below[..., :, None] * matrix[..., k, None, :]
     return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
+
+
+def gram_inverse(rows: Float[Array, "m n *lanes"]) -> Solve:
+    """`(U Uᵀ)⁻¹ b` as a function of `b`, for rows `U` with lanes as the last axis."""
+    m, index = len(rows), np.arange(len(rows))
+    at = lambda x: x.reshape(*x.shape, *[1] * (rows.ndim - 2))  # noqa: E731
+    matrix = ft.reduce(op.add, (x[:, None] * x for x in jnp.unstack(rows, axis=1)))
+    diagonal = jnp.stack([matrix[k, k] for k in range(m)])
+    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    added = eps_of(matrix) ** REGULARISATION_POWER * m**0.5
+    matrix = matrix / (size[:, None] * size) + at(added * np.eye(m))
+
+    def eliminate(k: Array, matrix: Array) -> Array:
+        is_k, row = at(index == k), matrix[k]
+        row, column = jnp.where(is_k, 1, row) / row[k], jnp.where(is_k, 1, matrix[:, k])
+        rest = jnp.where(is_k | is_k[:, None], 0, matrix) - column[:, None] * row
+        return jnp.where(at(jnp.maximum(index[:, None], index) > k), rest, matrix)
+
+    matrix = lax.fori_loop(0, m - 1, eliminate, matrix)
+    pivots = jnp.stack([matrix[k, k] for k in range(m)])
+    ones = np.ones((m, m))
+    left, right = (jnp.where(at(f > 0), matrix, 0) for f in (np.tril(ones, -1), np.triu(ones, 1)))
+
+    def solve(b: Array) -> Array:
+        x = b / size
+        x = (x + transposed_product(x, left)) / pivots
+        return (x + transposed_product(x, right)) / size
+
+    return solve
+
+
+def transposed_product(x, rows):
+    return ft.reduce(op.add, (rows[:, k] * x[k] for k in range(len(x))))
 
 
 def iterative_refinement(
