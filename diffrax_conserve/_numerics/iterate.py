@@ -173,7 +173,7 @@ def simplified_newton(
     For up to four constraints they are `directions` if these are given, and otherwise, after
     `FROZEN_STEPS` iterations, the gradients at the current state."""
     if MAX_UNROLLED < problem.magnitude.size <= MAX_BLOCK:
-        return with_lanes_last(ft.partial(_in_lanes, max_steps=max_steps))(problem, candidate)
+        return with_lanes_last(ft.partial(_with_jacobian_of_first, max_steps=max_steps))(problem, candidate)
     if problem.magnitude.size > MAX_UNROLLED:
         return _with_frozen_jacobian(problem, candidate, max_steps)
     return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
@@ -273,41 +273,43 @@ def _with_frozen_jacobian(
     return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
 
 
-def _in_lanes(each: Any, candidate: Array, is_batched: bool, *, max_steps: int) -> Solved:
-    """`_with_frozen_jacobian` for up to `MAX_BLOCK` constraints. In a batch the lanes are the last
-    axis of all arrays here."""
+def _with_jacobian_of_first(
+    each: Any, candidate: Array, is_batched: bool, *, max_steps: int
+) -> Solved:
+    """The matrix is that at the candidate, factored once, in the first step. Each test has a
+    Jacobian, for the scales at its state. In a batch the lanes are the last axis of all arrays."""
 
-    def linearised(problem: Problem, y: Array) -> tuple[Array, Array, Array]:
-        jacobian = problem.linearise(y)[1]
+    def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
+        g, jacobian = problem.linearise(y)
+        level, to_correct = problem.level(g, problem.scale(jacobian, y))
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
-        return problem.scale(jacobian, y), row_scales, rows.matrix
+        return level, to_correct, row_scales, rows.matrix
 
-    def tested(problem: Problem, y: Array, scale: Array) -> tuple[Array, Array]:
-        return problem.level(problem.residual(y), scale)
+    def factored(row_scales: Array, rows: Array) -> Any:
+        if is_batched:
+            return row_scales, rows, gram_inverse(rows)
+        return row_scales, rows, DenseRows(rows).gram(DenseRows(rows)).factorise()
 
-    candidate = lax.optimization_barrier(candidate)
-    scale, row_scales, rows = each(linearised)(candidate)
-    if is_batched:
-        solve = gram_inverse(rows)
-    else:
-        solve = DenseRows(rows).gram(DenseRows(rows)).factorise()
-
-    def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
-        level, to_correct = each(tested)(y, scale)
+    def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
+        y, factors, is_first = now
+        level, to_correct, row_scales, rows = each(tested)(y)
         tests_left = left_after_test(level, tests_left)
 
-        def move() -> Array:
-            multiplier = solve(to_correct / row_scales)
-            change = transposed_product(multiplier, jnp.moveaxis(rows, 0, 1))
-            return y - each(lambda problem, x: problem.factor.to_state(x))(change)
+        def move() -> Any:
+            found = lax.cond(is_first, lambda: factored(row_scales, rows), lambda: factors)
+            scales, directions, solve = found
+            change = transposed_product(solve(to_correct / scales), jnp.moveaxis(directions, 0, 1))
+            return y - each(lambda problem, x: problem.factor.to_state(x))(change), found
 
-        moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
-        return keep_done(tests_left, moved, y), tests_left
+        moved, factors = lax.cond(any_lane(tests_left > 0), move, lambda: (y, factors))
+        return (keep_done(tests_left, moved, y), factors, jnp.asarray(False)), tests_left
 
-    y, ok, num_iterations, _ = iterate(
-        advance, candidate, max_steps=max_steps, lanes=candidate.shape[1:]
-    )
-    return Solved(y, ok & each(Problem.is_on_manifold)(y), num_iterations)
+    candidate = lax.optimization_barrier(candidate)
+    like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
+    none = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    begin = candidate, none, jnp.asarray(True)
+    found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])
+    return found._replace(y=found.y[0])
 
 
 # ---- For starts far away ----

@@ -75,12 +75,13 @@ def gram_inverse(rows: Float[Array, "m n *lanes"]) -> Solve:
     ones = np.ones((m, m))
     left, right = (jnp.where(at(f > 0), matrix, 0) for f in (np.tril(ones, -1), np.triu(ones, 1)))
 
-    def solve(b: Array) -> Array:
-        x = b / size
-        x = (x + transposed_product(x, left)) / pivots
-        return (x + transposed_product(x, right)) / size
+    return jtu.Partial(_solve_gram, left, right, pivots, size)
 
-    return solve
+
+def _solve_gram(left, right, pivots, size, b: Array) -> Array:
+    x = b / size
+    x = (x + transposed_product(x, left)) / pivots
+    return (x + transposed_product(x, right)) / size
 
 
 def transposed_product(x, rows):
