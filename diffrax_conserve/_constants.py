@@ -35,6 +35,9 @@ MAX_UNROLLED = 4
 REGULARISATION_POWER = 3 / 4
 # So many steps of iterative refinement remove from a solution what the addition has changed in it.
 NUM_REFINEMENTS = 2
+# In a batch the sums over so many unknowns in a Gram matrix are written out. They take a third of
+# the time of a reduction; the program grows with them.
+MAX_WRITTEN_OUT = 64
 # Beside a unit of one within the bounds, `clip` has this derivative beyond them. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 SLOPE_BEYOND_BOUNDS = 1e-10

@@ -86,7 +86,7 @@ def measure(name, batch, steps, rounds=5):
     for _ in range(rounds):
         for label, run in runs.items():
             begin = time.perf_counter(), time.process_time()
-            ys, result = jax.block_until_ready(run())
+            _, result = jax.block_until_ready(run())
             end = time.perf_counter(), time.process_time()
             count = steps if label == "projected" else 8 * steps
             for kind, a, b in zip(("clock", "processor"), begin, end, strict=True):

@@ -41,7 +41,13 @@ from .._constants import (
     SLOPE_BEYOND_BOUNDS,
 )
 from .._fast.scalars import joined, loop_in_scalars, with_batch_flag, with_lanes_last
-from .linear import gram_inverse, permuted, pivot_order, roundoff_pivot_tolerance, transposed_product
+from .linear import (
+    gram_inverse,
+    permuted,
+    pivot_order,
+    roundoff_pivot_tolerance,
+    written_out_product,
+)
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -83,9 +89,7 @@ class _LoopState(NamedTuple):
     num_iterations: Array
 
 
-def iterate(
-    advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] = ()
-) -> Solved:
+def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] = ()) -> Solved:
     """Advances the unknowns until no test is left.
 
     `tests_left` is the number of tests that are left. The unknowns are tested before each step and
@@ -93,7 +97,8 @@ def iterate(
     the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which no test is left, as they are.
+    are done, for which no test is left, as they are. If the lanes are the last axis of the unknowns,
+    `lanes` is its shape, and there is a number of tests for each.
     """
 
     def body(now: _LoopState) -> _LoopState:
@@ -172,10 +177,11 @@ def simplified_newton(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     For up to four constraints they are `directions` if these are given, and otherwise, after
     `FROZEN_STEPS` iterations, the gradients at the current state."""
-    if MAX_UNROLLED < problem.magnitude.size <= MAX_BLOCK:
-        return with_lanes_last(ft.partial(_with_jacobian_of_first, max_steps=max_steps))(problem, candidate)
-    if problem.magnitude.size > MAX_UNROLLED:
+    if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
+    if problem.magnitude.size > MAX_UNROLLED:
+        run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
+        return with_lanes_last(run)(problem, candidate)
     return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
         (problem, candidate, directions)
     )
@@ -239,11 +245,55 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     return solved._replace(y=joined(candidate, solved.y))
 
 
+def _with_frozen_matrix(
+    each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
+) -> Solved:
+    """For up to `MAX_BLOCK` constraints: the matrix is that at the candidate, factored once, in the
+    first step. The Jacobian at each state serves for the scales of its residuals alone. It stands
+    at one place in the program, which is what makes this program small.
+
+    In a batch the lanes are the last axis of all arrays; see `with_lanes_last`.
+    """
+
+    def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
+        g, jacobian = problem.linearise(y)
+        level, to_correct = problem.level(g, problem.scale(jacobian, y))
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        return level, to_correct, row_scales, rows.matrix
+
+    def factored(row_scales: Array, rows: Array) -> Any:
+        if is_batched:
+            return row_scales, rows, gram_inverse(rows)
+        return row_scales, rows, DenseRows(rows).gram(DenseRows(rows)).factorise()
+
+    def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
+        y, at_candidate, is_first = now
+        level, to_correct, row_scales, rows = each(tested)(y)
+        tests_left = left_after_test(level, tests_left)
+
+        def move() -> Any:
+            kept = lax.cond(is_first, lambda: factored(row_scales, rows), lambda: at_candidate)
+            row_scales_there, directions, solve = kept
+            multiplier = solve(to_correct / row_scales_there)
+            change = written_out_product(jnp.moveaxis(directions, 1, 0), multiplier)
+            return y - each(lambda problem, x: problem.factor.to_state(x))(change), kept
+
+        moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, at_candidate))
+        return (keep_done(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
+
+    candidate = lax.optimization_barrier(candidate)
+    like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
+    at_candidate = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    begin = candidate, at_candidate, jnp.asarray(True)
+    found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])
+    return found._replace(y=found.y[0])
+
+
 @eqx.filter_jit
 def _with_frozen_jacobian(
     problem: Problem, candidate: Float[Array, " n"], max_steps: int
 ) -> Solved:
-    """The matrix is that at the candidate, factored once, so that a step evaluates only residuals.
+    """For more: the matrix is that at the candidate too, and a step evaluates only residuals.
 
     They are compared with the scales at the candidate, because those at each state would need a
     Jacobian. So at the end we test the result once more, by its own scales.
@@ -271,45 +321,6 @@ def _with_frozen_jacobian(
 
     y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
     return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
-
-
-def _with_jacobian_of_first(
-    each: Any, candidate: Array, is_batched: bool, *, max_steps: int
-) -> Solved:
-    """The matrix is that at the candidate, factored once, in the first step. Each test has a
-    Jacobian, for the scales at its state. In a batch the lanes are the last axis of all arrays."""
-
-    def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
-        g, jacobian = problem.linearise(y)
-        level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
-        return level, to_correct, row_scales, rows.matrix
-
-    def factored(row_scales: Array, rows: Array) -> Any:
-        if is_batched:
-            return row_scales, rows, gram_inverse(rows)
-        return row_scales, rows, DenseRows(rows).gram(DenseRows(rows)).factorise()
-
-    def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        y, factors, is_first = now
-        level, to_correct, row_scales, rows = each(tested)(y)
-        tests_left = left_after_test(level, tests_left)
-
-        def move() -> Any:
-            found = lax.cond(is_first, lambda: factored(row_scales, rows), lambda: factors)
-            scales, directions, solve = found
-            change = transposed_product(solve(to_correct / scales), jnp.moveaxis(directions, 0, 1))
-            return y - each(lambda problem, x: problem.factor.to_state(x))(change), found
-
-        moved, factors = lax.cond(any_lane(tests_left > 0), move, lambda: (y, factors))
-        return (keep_done(tests_left, moved, y), factors, jnp.asarray(False)), tests_left
-
-    candidate = lax.optimization_barrier(candidate)
-    like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
-    none = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    begin = candidate, none, jnp.asarray(True)
-    found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])
-    return found._replace(y=found.y[0])
 
 
 # ---- For starts far away ----
