@@ -97,8 +97,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
     the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which no test is left, as they are. If the lanes are the last axis of the unknowns,
-    `lanes` is its shape, and there is a number of tests for each.
+    are done, for which no test is left, as they are. If their last axis are the lanes, `lanes` is
+    its shape, and there is a number of tests for each.
     """
 
     def body(now: _LoopState) -> _LoopState:
