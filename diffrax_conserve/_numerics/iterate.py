@@ -143,7 +143,7 @@ def left_after_step(converged: Array, hopeful: Array, tests_left: Array) -> Arra
 
 
 @jax.custom_batching.custom_vmap
-def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+def any_lane(flag: Bool[Array, "*lanes"]) -> Bool[Array, ""]:
     """Whether the flag of any lane of a batch is set, for the conditions of loops and branches.
 
     If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
@@ -259,7 +259,7 @@ def _with_frozen_matrix(
         g, jacobian = problem.linearise(y)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
-        return level, to_correct, row_scales, rows.matrix
+        return level, to_correct, row_scales, rows.matrix  # pyright: ignore
 
     def factored(row_scales: Array, rows: Array) -> Any:
         if is_batched:
