@@ -154,7 +154,7 @@ def any_lane(flag: Bool[Array, "*lanes"]) -> Bool[Array, ""]:
 
 
 @any_lane.def_vmap
-def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
+def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[Array, bool]:
     del size, axes
     return any_lane(jnp.any(flags)), False
 
