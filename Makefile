@@ -195,7 +195,7 @@ bench-published: $(BENCH) ## compare with what others published; tables of a pag
 	set -e; for name in $(PUBLISHED); do $(BIN)/python benchmarks/published/$$name.py; done
 	$(BIN)/python benchmarks/published/tables.py --write
 
-SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints $(STUDIES:%=studies/%) learned/chemistry \
+SMOKABLE := $(COSTS:%=cost/%) cost/many_constraints cost/few_constraints $(STUDIES:%=studies/%) learned/chemistry \
   $(PUBLISHED:%=published/%)
 SMOKED ?= cost/balance learned/chemistry studies/long_run published/mechanisms
 

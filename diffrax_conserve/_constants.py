@@ -35,6 +35,9 @@ MAX_UNROLLED = 4
 REGULARISATION_POWER = 3 / 4
 # The number of steps of iterative refinement that remove the effect of this shift.
 NUM_REFINEMENTS = 2
+# In a batch the sums over so many unknowns in a Gram matrix are written out. They take a third of
+# the time of a reduction; the program grows with them.
+MAX_WRITTEN_OUT = 64
 # The derivative of `clip` beyond the bounds; within them it is one. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 SLOPE_BEYOND_BOUNDS = 1e-10

@@ -35,12 +35,19 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import (
     BACKTRACKING_FACTOR,
     FROZEN_STEPS,
+    MAX_BLOCK,
     MAX_UNROLLED,
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
 )
-from .._fast.scalars import joined, loop_in_scalars, with_batch_flag
-from .linear import forward_elimination, permuted, roundoff_pivot_tolerance
+from .._fast.scalars import joined, loop_in_scalars, with_batch_flag, with_lanes_last
+from .linear import (
+    forward_elimination,
+    gram_inverse,
+    permuted,
+    roundoff_pivot_tolerance,
+    written_out_product,
+)
 from .problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -73,7 +80,7 @@ class Solved(NamedTuple):
 # ---- The loop ----
 
 
-def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
+def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] = ()) -> Solved:
     """Advances the unknowns until no test is left.
 
     `tests_left` is the number of tests that are left. The unknowns are tested before each step and
@@ -81,7 +88,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
     the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which no test is left, as they are.
+    are done, for which no test is left, as they are. If their last axis are the lanes, `lanes` is
+    its shape, and there is a number of tests for each.
     """
 
     def body(now: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
@@ -89,7 +97,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int) -> Solved:
         return y, tests_left, now[2] + (tests_left > 0).astype(int)
 
     # The carry is small, because for small systems moving it costs more than the arithmetic.
-    begin = y, initial_tests(max_steps), jnp.asarray(0)
+    tests_left = jnp.broadcast_to(initial_tests(max_steps), lanes)
+    begin = y, tests_left, jnp.zeros(lanes, int)
     y, tests_left, count = lax.while_loop(lambda now: any_lane(now[1] > 0), body, begin)
     return Solved(y, tests_left == 0, count)
 
@@ -126,18 +135,18 @@ def left_after_step(converged: Array, hopeful: Array, tests_left: Array) -> Arra
 
 
 @jax.custom_batching.custom_vmap
-def any_lane(flag: Bool[Array, ""]) -> Bool[Array, ""]:
+def any_lane(flag: Bool[Array, "*lanes"]) -> Bool[Array, ""]:
     """Whether the flag of any lane of a batch is set, for the conditions of loops and branches.
 
     If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
     array in the carry, which keeps the lanes that are done. With this condition, which is the same
     for all lanes, it adds none. A branch with such a condition remains a branch.
     """
-    return flag
+    return jnp.any(flag)
 
 
 @any_lane.def_vmap
-def _any_lane(size: int, axes: Any, flags: Bool[Array, " lanes"]) -> tuple[Array, bool]:
+def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[Array, bool]:
     del size, axes
     return any_lane(jnp.any(flags)), False
 
@@ -160,8 +169,11 @@ def simplified_newton(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     For up to four constraints they are `directions` if these are given, and otherwise, after
     `FROZEN_STEPS` iterations, the gradients at the current state."""
-    if problem.magnitude.size > MAX_UNROLLED:
+    if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
+    if problem.magnitude.size > MAX_UNROLLED:
+        run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
+        return with_lanes_last(run)(problem, candidate)
     return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
         (problem, candidate, directions)
     )
@@ -226,11 +238,55 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     return solved._replace(y=joined(candidate, solved.y))
 
 
+def _with_frozen_matrix(
+    each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
+) -> Solved:
+    """For up to `MAX_BLOCK` constraints: the matrix is that at the candidate, factored once, in the
+    first step. The Jacobian at each state serves for the scales of its residuals alone. It stands
+    at one place in the program, which is what makes this program small.
+
+    In a batch the lanes are the last axis of all arrays; see `with_lanes_last`.
+    """
+
+    def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
+        g, jacobian = problem.linearise(y)
+        level, to_correct = problem.level(g, problem.scale(jacobian, y))
+        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        return level, to_correct, row_scales, rows.matrix  # pyright: ignore
+
+    def factored(row_scales: Array, rows: Array) -> Any:
+        if is_batched:
+            return row_scales, rows, gram_inverse(rows)
+        return row_scales, rows, DenseRows(rows).gram(DenseRows(rows)).factorise()
+
+    def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
+        y, at_candidate, is_first = now
+        level, to_correct, row_scales, rows = each(tested)(y)
+        tests_left = left_after_test(level, tests_left)
+
+        def move() -> Any:
+            kept = lax.cond(is_first, lambda: factored(row_scales, rows), lambda: at_candidate)
+            row_scales_there, directions, solve = kept
+            multiplier = solve(to_correct / row_scales_there)
+            change = written_out_product(jnp.moveaxis(directions, 1, 0), multiplier)
+            return y - each(lambda problem, x: problem.factor.to_state(x))(change), kept
+
+        moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, at_candidate))
+        return (keep_done(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
+
+    candidate = lax.optimization_barrier(candidate)
+    like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
+    at_candidate = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    begin = candidate, at_candidate, jnp.asarray(True)
+    found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])
+    return found._replace(y=found.y[0])
+
+
 @eqx.filter_jit
 def _with_frozen_jacobian(
     problem: Problem, candidate: Float[Array, " n"], max_steps: int
 ) -> Solved:
-    """The matrix is that at the candidate, factored once, so that a step evaluates only residuals.
+    """For more: the matrix is that at the candidate too, and a step evaluates only residuals.
 
     They are compared with the scales at the candidate, because those at each state would need a
     Jacobian. So at the end we test the result once more, by its own scales.

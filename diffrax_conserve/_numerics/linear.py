@@ -1,6 +1,7 @@
 """The elimination of small matrices, LAPACK's factors of large ones, and iterative refinement."""
 
 import functools as ft
+import operator as op
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import NUM_REFINEMENTS, ROUNDOFF
+from .._constants import MAX_WRITTEN_OUT, NUM_REFINEMENTS, REGULARISATION_POWER, ROUNDOFF
 from .._tree import eps_of
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -51,6 +52,53 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
         left = left - below[..., :, None] * left[..., k, None, :]
         matrix = matrix - below[..., :, None] * matrix[..., k, None, :]
     return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
+
+
+def gram_inverse(rows: Float[Array, "m n lanes"]) -> Solve:
+    """`(U Uᵀ)⁻¹ b` as a function of `b`, for the rows `U` of each lane, by Gaussian elimination as
+    in `inverse_factors`.
+
+    What is done with an element is one loop over the lanes, and the steps of the elimination are a
+    loop too, so that no kernel repeats the steps before it. The inverses of both factors take the
+    places of the elements that were eliminated (Gauss and Jordan).
+    """
+    m, n, _ = rows.shape
+    rows = rows.astype(np.promote_types(rows.dtype, np.float32))
+    if n > MAX_WRITTEN_OUT:
+        matrix = jnp.einsum("ikl,jkl->ijl", rows, rows, precision=lax.Precision.HIGHEST)
+    else:
+        matrix = ft.reduce(op.add, (x[:, None] * x for x in jnp.unstack(rows, axis=1)))
+    diagonal = jnp.stack([matrix[k, k] for k in range(m)])
+    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
+    added = eps_of(matrix) ** REGULARISATION_POWER * m**0.5
+    matrix = matrix / (size[:, None] * size) + added * np.eye(m, dtype=rows.dtype)[..., None]
+    index = np.arange(m)[:, None]
+
+    def eliminate(k: Array, matrix: Array) -> Array:
+        row, column = matrix[k], matrix[:, k]
+        is_k = index == k
+        row, column = jnp.where(is_k, 1, row) / row[k], jnp.where(is_k, 1, column)
+        crossing = (is_k | is_k.T)[..., None]
+        rest = jnp.where(crossing, 0, matrix) - column[:, None] * row
+        return jnp.where((jnp.maximum(index, index.T) > k)[..., None], rest, matrix)
+
+    matrix = lax.fori_loop(0, m - 1, eliminate, matrix)
+    pivots = jnp.stack([matrix[k, k] for k in range(m)])
+    left = jnp.where((index > index.T)[..., None], matrix, 0)
+    right = jnp.where((index < index.T)[..., None], matrix, 0)
+    return jtu.Partial(_solution_of_lanes, left, right, pivots, size)
+
+
+def _solution_of_lanes(left: Array, right: Array, pivots: Array, size: Array, b: Array) -> Array:
+    # XLA does not repeat a quotient in each kernel that uses it, as it does with a product.
+    x = b.astype(size.dtype) / size
+    x = (x + written_out_product(left, x)) / pivots
+    return ((x + written_out_product(right, x)) / size).astype(b.dtype)
+
+
+def written_out_product(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
+    """`matrix x`, as a sum that is written out, which XLA fuses with what is around it."""
+    return ft.reduce(op.add, (matrix[:, k] * x[k] for k in range(len(x))))
 
 
 def iterative_refinement(

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import diffrax_conserve as dfc
 from diffrax_conserve._numerics import problem
+from diffrax_conserve._numerics.linear import gram_inverse
 from diffrax_conserve._numerics.rows import DenseRows, RegularisedGram
 
 from ..problems import EPS
@@ -78,3 +80,52 @@ def test_the_scale_of_a_residual_is_the_size_of_its_terms():
     jacobian = DenseRows(jnp.array([[2.0, 0.5], [0.0, 0.0]]))
     np.testing.assert_array_equal(jacobian.absolute_matvec(abs(y)), [8.0, 0.0])
     assert problem.relative_to_scale(jnp.array(2.0), jnp.array(0.0)) == 2.0
+
+
+@pytest.mark.parametrize("n", [9, 70])
+def test_the_inverse_of_many_lanes_is_that_of_each(n):
+    """Also if a lane is NaN, and if its rows depend on each other."""
+    rows, b = np.random.default_rng(0).normal(size=(4, 7, n)), np.linspace(-1, 1, 7)
+    rows[2, 3], rows[3, 6] = np.nan, 2 * rows[3, 0]
+    consistent = np.where(np.arange(7) == 6, 2 * b[0], b)
+    solve = lambda rows, b: gram_inverse(jnp.moveaxis(rows, 0, -1))(b[:, None])  # noqa: E731
+    found = np.asarray(jax.jit(solve)(rows, consistent)).T
+    for k in (0, 1):
+        gram = rows[k] @ rows[k].T
+        tol = 10 * EPS**0.75 * np.linalg.cond(gram)
+        np.testing.assert_allclose(gram @ found[k], consistent, 0, tol)
+    assert np.all(np.isnan(found[2]))
+    np.testing.assert_allclose(rows[3] @ (rows[3].T @ found[3]), consistent, 0, 1e-3)
+
+
+def quadratics(t, y, args):
+    return jnp.einsum("kij,i,j->k", np.random.default_rng(0).normal(size=(6, 9, 9)), y, y)
+
+
+def test_a_lane_with_six_constraints_is_projected_as_alone():
+    """In a batch of batches too, beside a lane that is NaN; and its derivative is that of the state
+    alone."""
+    rng = np.random.default_rng(1)
+    ys = rng.normal(size=(2, 3, 9))
+    values = np.stack([[quadratics(0.0, y, None) for y in row] for row in ys])
+    ys = ys + 1e-3 * rng.normal(size=ys.shape)
+    ys[1, 1, 4] = np.nan
+
+    def projected(y, value):
+        integral, projection = dfc.FirstIntegral(quadratics), dfc.SimplifiedNewton()
+        y, info = dfc.project(integral, y, value=value, projection=projection)
+        return y, info.ok, info.num_iterations
+
+    def with_tangent(y, value):
+        return *projected(y, value), jax.jvp(lambda y: projected(y, value)[0], (y,), (y,))[1]
+
+    both = jax.jit(jax.vmap(jax.vmap(with_tangent)))
+    assert "lapack" not in both.lower(ys, values).as_text()
+    together, alone = both(ys, values), jax.jit(with_tangent)
+    for i, j in np.ndindex(2, 3):
+        one = alone(ys[i, j], values[i, j])
+        assert bool(one[1]) == bool(together[1][i, j]) == ((i, j) != (1, 1))
+        if one[1]:
+            assert int(one[2]) == int(together[2][i, j])
+            np.testing.assert_allclose(together[0][i, j], one[0], 0, 1e-13)
+            np.testing.assert_allclose(together[3][i, j], one[3], 0, 1e-10)
