@@ -49,7 +49,6 @@ LAYERS = (
 
 # Packages that only these parts may import, because they are optional.
 CONFINED = {
-    "asdex": {"_large"},
     "hypothesis": {"testing"},
     "klujax": {"_large"},
     "matplotlib": {"reproduce", "_diagnostics"},
@@ -57,8 +56,6 @@ CONFINED = {
 
 # Private names of other packages that have no public equivalent: `(file, name)`. The file says why.
 PRIVATE_ALLOWED = {
-    ("_large/asdex_import.py", "jax._src.core"),
-    ("_large/asdex_import.py", "jax._src.core.ClosedJaxpr"),
     ("_solver/diffrax_private.py", "diffrax._term.WrapTerm"),
     ("_solver/diffrax_private.py", "diffrax._term.AdjointTerm"),
     ("_solver/diffrax_private.py", "diffrax.RESULTS._index_to_message"),

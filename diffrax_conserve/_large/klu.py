@@ -27,8 +27,7 @@ from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
 from .._tree import eps_of, irregular_weights
-from .asdex_import import asdex
-from .detection import constants_of, content_key, jacobian_places
+from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
 
 # A perturbation in the imaginary part of a real matrix. Its square is below the roundoff of any
 # element, so that it changes no real part.
@@ -63,13 +62,12 @@ def available(dtype: Any) -> bool:
 
 @ft.cache
 def why_not() -> str:
-    """Why the packages cannot be imported, and what to do; empty if they can be."""
+    """Why the package cannot be imported, and what to do; empty if it can be."""
     try:
-        asdex()
         klujax()
     except Exception as error:  # missing, or made for another version of jax
         return (
-            f"the packages for sparse ones cannot be imported ({type(error).__name__}: {error}): "
+            f"the package for sparse ones cannot be imported ({type(error).__name__}: {error}): "
             "`pip install 'diffrax-conserve[sparse]'`."
         )
     return ""
@@ -327,11 +325,10 @@ class SparseJacobian:
         widest = np.max(counts, initial=0)
         dense = (counts > DENSE_ROW_RATIO * max(1, np.median(counts))) | (widest > shape[0])
         few = ~dense[rows]
-        found = asdex().SparsityPattern.from_coo(rows[few], columns[few], shape)
-        colours, number = asdex().color_cols(found) if np.any(few) else (np.zeros(shape[1], int), 0)
+        self._colours, number = coloured(columns[few], rows[few], shape[1])
+        number = number if np.any(few) else 0
         self.rows, self.columns, self.dense_rows = rows, columns, np.flatnonzero(dense)
-        self.num_passes = int(number), len(self.dense_rows)
-        self._colours = np.asarray(colours)
+        self.num_passes = number, len(self.dense_rows)
         by_colour = self._colours[columns] * shape[0] + rows
         by_row = number * shape[0] + (np.cumsum(dense) - 1)[rows] * shape[1] + columns
         self._taken = np.where(few, by_colour, by_row)
@@ -357,8 +354,8 @@ def sparse_jacobian(fn: Callable[[Array], Array], x: Any) -> SparseJacobian | No
     if key not in _KNOWN:
         with jax.ensure_compile_time_eval():
             try:
-                rows, columns = jacobian_places(traced, x)
-            except NotImplementedError:  # an operation that asdex does not know
+                rows, columns = jacobian_places(traced)
+            except NotSparse:
                 _KNOWN[key] = None
             else:
                 shape = traced.out_avals[0].shape[0], x.shape[0]
