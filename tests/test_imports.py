@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # A part of the package may import those of the lines above it. A part is a file or folder directly
 # under the package, and `diffrax_conserve` is its `__init__.py`.
 LAYERS = (
-    {"_custom_types", "_printing", "_options", "_constants", "_hashable"},
+    {"_custom_types", "_printing", "_options", "_constants", "_hashable", "_memory"},
     {"_tree", "_time", "_fast"},
     {"_manifold", "_large"},
     {"_balance", "_numerics"},

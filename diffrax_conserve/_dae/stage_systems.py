@@ -145,7 +145,7 @@ class _Together:
         return lambda x: self._stages[0].values(residual, x)
 
 
-@ft.cache
+@ft.lru_cache(256)
 def _together(by_y: SparseJacobian, by_slope: SparseJacobian, size: int) -> _Together:
     return _Together(by_y, by_slope, size)
 

@@ -11,7 +11,7 @@ which something is multiplied.
 
 import dataclasses
 import functools as ft
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from math import prod
 from typing import Any
 
@@ -393,19 +393,19 @@ def coloured(lines: np.ndarray, across: np.ndarray, number: int) -> tuple[np.nda
     colour have no element in the same place across, and the number of colours. Each line in turn
     gets the first colour that is free, in the order given or, if that takes too many, those with
     most elements first."""
-    order = np.argsort(lines, kind="stable")
-    counts = np.bincount(lines, minlength=number)
-    each = np.split(across[order], np.cumsum(counts)[:-1])
-    each, sizes = [x.tolist() for x in each], np.bincount(across)
+    order, counts = np.argsort(lines, kind="stable"), np.bincount(lines, minlength=number)
+    flat, ends = across[order].tolist(), np.cumsum(counts).tolist()
+    each = [flat[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+    sizes = np.bincount(across)
     found = _greedy(range(number), each, len(sizes))
     if found[1] > np.max(sizes, initial=0):  # there must be as many as elements in a place across
-        others = _greedy(np.argsort(-counts, kind="stable"), each, len(sizes))
+        others = _greedy(np.argsort(-counts, kind="stable").tolist(), each, len(sizes))
         found = min(found, others, key=lambda found: found[1])
     return found
 
 
-def _greedy(order: Any, each: list[list[int]], size: int) -> tuple[np.ndarray, int]:
-    colours, taken = np.zeros(len(each), int), [0] * size  # the bits of a number are colours
+def _greedy(order: Iterable[int], each: list[list[int]], size: int) -> tuple[np.ndarray, int]:
+    colours, taken = [0] * len(each), [0] * size  # the bits of a number are colours
     for line in order:
         used = 0
         for i in each[line]:
@@ -414,4 +414,4 @@ def _greedy(order: Any, each: list[list[int]], size: int) -> tuple[np.ndarray, i
         for i in each[line]:
             taken[i] |= free
         colours[line] = free.bit_length() - 1
-    return colours, int(np.max(colours, initial=-1)) + 1
+    return np.array(colours, int), max(colours, default=-1) + 1

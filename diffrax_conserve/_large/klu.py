@@ -26,6 +26,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
+from .._memory import Memory
 from .._tree import eps_of, irregular_weights
 from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
 
@@ -193,7 +194,7 @@ class Places:
         return Places(rows, columns, 2 * n), np.lexsort((rows, columns))
 
 
-# The orders in which KLU eliminates. Compiled programs contain their addresses, so they are kept.
+# The orders in which KLU eliminates. Compiled programs contain their addresses, so all are kept.
 _ANALYZED: dict[Places, Any] = {}
 
 
@@ -319,49 +320,60 @@ class SparseJacobian:
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
         self.shape, order = shape, np.lexsort((rows, columns))
-        rows, columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
+        self.rows, self.columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
+
+    @property
+    def num_passes(self) -> tuple[int, int]:
+        return self._passes[1], len(self.dense_rows)
+
+    @property
+    def dense_rows(self) -> np.ndarray:
+        return self._passes[2]
+
+    @ft.cached_property
+    def _passes(self) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
+        """The colours of the columns, and their number; the dense rows; and where each element is
+        among the results of all passes. Not all places that are found are differentiated."""
+        rows, columns, shape = self.rows, self.columns, self.shape
         counts = np.bincount(rows, minlength=shape[0])
         # There are at least as many colours as elements in a row, and few rows take fewer passes.
         widest = np.max(counts, initial=0)
         dense = (counts > DENSE_ROW_RATIO * max(1, np.median(counts))) | (widest > shape[0])
         few = ~dense[rows]
-        self._colours, number = coloured(columns[few], rows[few], shape[1])
+        colours, number = coloured(columns[few], rows[few], shape[1])
         number = number if np.any(few) else 0
-        self.rows, self.columns, self.dense_rows = rows, columns, np.flatnonzero(dense)
-        self.num_passes = number, len(self.dense_rows)
-        by_colour = self._colours[columns] * shape[0] + rows
+        by_colour = colours[columns] * shape[0] + rows
         by_row = number * shape[0] + (np.cumsum(dense) - 1)[rows] * shape[1] + columns
-        self._taken = np.where(few, by_colour, by_row)
+        return colours, number, np.flatnonzero(dense), np.where(few, by_colour, by_row)
 
     def values(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Float[Array, " k"]:
         """The values of the elements, in the order of the places."""
-        colours, dense = self.num_passes
-        seeds = jnp.asarray(np.arange(colours)[:, None] == self._colours, x.dtype)
+        colours, number, dense_rows, taken = self._passes
+        seeds, dense = jnp.asarray(np.arange(number)[:, None] == colours, x.dtype), len(dense_rows)
         passes = [jax.vmap(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(seeds).reshape(-1)]
         if dense:
             vjp = jax.vjp(fn, x)[1]
             rows = jnp.zeros((dense, jax.eval_shape(fn, x).size), x.dtype)
-            rows = rows.at[np.arange(dense), self.dense_rows].set(1)
+            rows = rows.at[np.arange(dense), dense_rows].set(1)
             passes.append(jax.vmap(lambda row: vjp(row)[0])(rows).reshape(-1))
-        return jnp.concatenate(passes)[self._taken]
+        return jnp.concatenate(passes)[taken]
 
 
 def sparse_jacobian(fn: Callable[[Array], Array], x: Any) -> SparseJacobian | None:
     """The places of the Jacobian of a function of a vector like `x`; `None` if they cannot be
     found. Constants of the function that JAX traces may have any values."""
     traced = jax.make_jaxpr(fn)(jax.ShapeDtypeStruct(x.shape, x.dtype))
-    key = str(traced.jaxpr), *map(content_key, constants_of(traced))
-    if key not in _KNOWN:
+
+    def found() -> SparseJacobian | None:
         with jax.ensure_compile_time_eval():
             try:
                 rows, columns = jacobian_places(traced)
             except NotSparse:
-                _KNOWN[key] = None
-            else:
-                shape = traced.out_avals[0].shape[0], x.shape[0]
-                _KNOWN[key] = SparseJacobian(rows, columns, shape)
-    return _KNOWN[key]
+                return None
+        return SparseJacobian(rows, columns, (traced.out_avals[0].shape[0], x.shape[0]))
+
+    return _KNOWN((str(traced.jaxpr), *map(content_key, constants_of(traced))), found)
 
 
 # The Jacobians that were found, by their functions.
-_KNOWN: dict[Any, SparseJacobian | None] = {}
+_KNOWN = Memory()

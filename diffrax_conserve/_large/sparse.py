@@ -36,6 +36,7 @@ from .._constants import (
     MAX_UNROLLED,
     MIN_SPARSE,
 )
+from .._memory import Memory
 from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
 from .klu import Places, available
 
@@ -226,14 +227,16 @@ def pattern_of(
     # Equal functions have equal jaxprs and equal constants.
     traced = [jax.make_jaxpr(part)(y) for part in parts]
     keys = tuple((str(x.jaxpr), *map(content_key, constants_of(x))) for x in traced)
-    if keys not in _KNOWN:
+
+    def found() -> Pattern | None:
         with jax.ensure_compile_time_eval():
             try:
-                found = [jacobian_places(x) for x in traced]
-                _KNOWN[keys] = _sparse((m, n), list(zip(sizes, found, strict=True)), y.dtype)
+                places = map(jacobian_places, traced)
+                return _sparse((m, n), list(zip(sizes, places, strict=True)), y.dtype)
             except NotSparse:
-                _KNOWN[keys] = None
-    pattern = _KNOWN[keys]
+                return None
+
+    pattern = _KNOWN(keys, found)
     if pattern is None and m * n * y.dtype.itemsize > _LARGE:
         warnings.warn(
             f"The Jacobian of the {m} constraints is not sparse, or its pattern is not known when "
@@ -250,7 +253,7 @@ def pattern_of(
 
 
 # The patterns that were found, by their functions. Detection takes seconds for large systems.
-_KNOWN: dict[Any, Pattern | None] = {}
+_KNOWN = Memory()
 
 
 def _sparse(shape: tuple[int, int], found: list[Any], dtype: Any) -> Pattern | None:

@@ -1,0 +1,24 @@
+"""What is found once and needed again, as long as it is among the latest."""
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+
+class Memory:
+    """What was found, by its key. The least recently used is forgotten, and found again if it is
+    needed, so that a process that traces ever new functions does not grow with their number."""
+
+    def __init__(self, most: int = 256):
+        self._most, self._found = most, OrderedDict[Any, tuple[Any]]()
+
+    def __call__(self, key: Any, find: Callable[[], Any]) -> Any:
+        # Each operation on the dictionary is one for all threads. Two may find the same.
+        found = self._found.pop(key, None) or (find(),)
+        self._found[key] = found
+        while len(self._found) > self._most:
+            self._found.popitem(last=False)
+        return found[0]
+
+    def __len__(self) -> int:
+        return len(self._found)
