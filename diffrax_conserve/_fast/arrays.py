@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .jaxprs import num_equations, outputs, walk
-from .scalars import BY_INDICES, ELEMENTWISE, KNOWN, MOVES, moved_elements
+from .scalars import BY_INDICES, ELEMENTWISE, KNOWN, MOVES, moved_elements, without_sharding
 
 # A choice of so many pieces at most is made of slices, not by indices.
 _PIECES = 8
@@ -419,6 +419,5 @@ def computed(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray | list[np.ndarray
         with np.errstate(all="ignore"):
             return KNOWN[name](*arrays)
     if name in MOVES:
-        given = {k: v for k, v in params.items() if v is not None and "sharding" not in k}
-        return MOVES[name](*arrays, **given)
+        return MOVES[name](*arrays, **without_sharding(params))
     return None

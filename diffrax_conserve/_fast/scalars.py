@@ -250,6 +250,12 @@ def moved_elements(
     return tuple(np.broadcast_to(x, moved) for x in at), np.broadcast_to(inside, moved)
 
 
+def without_sharding(params: Any) -> dict[str, Any]:
+    """The parameters of a primitive that matter here: those that are `None` do not, nor those that
+    tell on which device something is."""
+    return {k: v for k, v in params.items() if v is not None and "sharding" not in k}
+
+
 def moved_by(
     eqn: Any, shape: Sequence[int], update_shape: Sequence[int], indices: list[np.ndarray]
 ) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
@@ -383,13 +389,7 @@ class _Program:
         name, params = eqn.primitive.name, eqn.params
         if eqn.effects or any(_is_key(var.aval) for var in eqn.outvars):
             raise _NotWrittenOut
-        # Parameters that are `None`, and those that tell on which device something is, do not
-        # matter here.
-        given = {
-            key: value
-            for key, value in params.items()
-            if value is not None and key not in ("sharding", "out_sharding")
-        }
+        given = without_sharding(params)
         dtype = eqn.outvars[0].aval.dtype if eqn.outvars else None
         if name in MOVES:
             moved = MOVES[name](*inputs, **given)
