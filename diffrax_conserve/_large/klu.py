@@ -257,6 +257,27 @@ class Factor:
         return tuple(jnp.where(done, x, jnp.nan) for x in results)
 
 
+class RealFactor:
+    """The factor of a real matrix with the tiny imaginary parts, in units of its rows and columns,
+    which tells whether the matrix is regular too. Solutions are NaN if it is not."""
+
+    def __init__(self, places: Places, values: Float[Array, " k"]):
+        self._factor, self.is_regular = None, jnp.asarray(False)
+        if places.permutation is not None:
+            scaled, self._heights, self._widths, b = places.in_general_position(values)
+            self._factor = Factor(places, scaled)
+            self.is_regular = is_bounded(self._factor.solve(b))
+
+    def solve(self, b: Float[Array, " n"], after: Any = None) -> Float[Array, " n"]:
+        if self._factor is None:
+            return jnp.full_like(b, jnp.nan)
+        after = self.is_regular if after is None else after
+        return self._factor.solve(b / self._heights, after).real / self._widths
+
+    def freed(self, last: Array, *results: Array) -> tuple[Array, ...]:
+        return results if self._factor is None else self._factor.freed(last, *results)
+
+
 class _Calls(NamedTuple):
     factor: Primitive
     free: Primitive
