@@ -143,7 +143,7 @@ class _Walker:
     def _scanned(self, params: Any, xs: list[_Array]) -> list[_Array]:
         first, length, found = params["num_consts"], params["length"], []
         last = first + params["num_carry"]
-        if length > _MOST_STEPS:
+        if not 0 < length <= _MOST_STEPS:
             raise NotSparse
         consts, carry, order = xs[:first], xs[first:last], range(length)
         for i in reversed(order) if params["reverse"] else order:
@@ -360,4 +360,4 @@ def _greedy(order: Iterable[int], each: list[list[int]], size: int) -> tuple[np.
         for i in each[line]:
             taken[i] |= free
         colours[line] = free.bit_length() - 1
-    return np.array(colours, int), max(colours, default=-1) + 1
+    return np.array(colours, int), max(taken, default=0).bit_length()

@@ -362,7 +362,6 @@ class SparseJacobian:
         dense = (counts > DENSE_ROW_RATIO * max(1, np.median(counts))) | (widest > shape[0])
         few = ~dense[rows]
         colours, number = coloured(columns[few], rows[few], shape[1])
-        number = number if np.any(few) else 0
         by_colour = colours[columns] * shape[0] + rows
         by_row = number * shape[0] + (np.cumsum(dense) - 1)[rows] * shape[1] + columns
         return colours, number, np.flatnonzero(dense), np.where(few, by_colour, by_row)

@@ -123,6 +123,11 @@ def test_lines_of_one_colour_share_no_element():
     assert colours.max() + 1 == number <= 15
 
 
+def test_lines_without_elements_need_no_colour():
+    assert coloured(np.zeros(0, int), np.zeros(0, int), 3)[1] == 0
+    assert coloured(np.array([1]), np.array([0]), 3)[1] == 1
+
+
 def test_a_band_has_as_many_colours_as_elements_in_a_row():
     rows, columns = np.nonzero(np.tri(300, k=2) * np.tri(300, k=2).T)
     assert coloured(columns, rows, 300)[1] == 5
