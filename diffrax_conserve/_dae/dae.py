@@ -388,7 +388,8 @@ class DAE(Hashable):
 
     def _equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
         """The equations as a function of vectors, for states like `y`."""
-        size, given = ravel(y).size, len(self._names(t, y, args))
+        values = jax.eval_shape(lambda: self._values(t, y, y, args))
+        size, given = ravel(y).size, sum(x.size * _parts(x) for x in jtu.tree_leaves(values))
         which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
         if which == "algebraic":
             z = ravel(y[1]).size

@@ -66,7 +66,7 @@ class SparseSystems(NamedTuple):
 
     @property
     def stages_solution(self) -> Callable[[Array, Array], Array]:
-        return self.places.of_stages.solve
+        return self.places.stages_solution
 
     @property
     def stages_jacobian(self) -> Callable[[Any], Any]:
@@ -131,9 +131,8 @@ class _Together:
         places = Places(rows, columns, 3 * n)
         return SparseJacobian(places.rows, places.columns, (3 * n, 3 * n)), places
 
-    @property
-    def of_stages(self) -> Places:
-        return self._stages[1]
+    def stages_solution(self, values: Array, b: Array) -> Array:
+        return self._stages[1].solve(values, b)
 
     def stages_jacobian(self, residual: Callable[[Array], Array]) -> Callable[[Array], Array]:
         return lambda x: self._stages[0].values(residual, x)
