@@ -88,16 +88,13 @@ NEWEST_PYTHON ?= $(shell for minor in 16 15 14 13 12 11; do \
   "$$found" -c "" 2>/dev/null && echo "$$found" && exit; done; done; echo "$(PYTHON)")
 NEWEST := $(VENV)/newest
 
-# Without the upper bounds of the extra `sparse`, of which uv can be told. A failure says that a
-# bound is needed, or that the code must change.
-newest: | $(BIN)/python ## run the tests with the newest Python, jax and asdex that can be had
+# A failure says that a bound is needed, or that the code must change.
+newest: | $(BIN)/python ## run the tests with the newest Python and jax that can be had
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv venv --quiet --clear --python "$(NEWEST_PYTHON)" $(NEWEST)
-	printf 'jax\nasdex\n' > $(NEWEST)/overrides.txt
-	$(BIN)/uv pip install --quiet --python $(NEWEST)/bin/python --overrides $(NEWEST)/overrides.txt \
-	  --editable '.[sparse,test]'
+	$(BIN)/uv pip install --quiet --python $(NEWEST)/bin/python --editable '.[sparse,test]'
 	@$(NEWEST)/bin/python --version
-	@$(BIN)/uv pip freeze --quiet --python $(NEWEST)/bin/python | grep -E '^(asdex|diffrax|equinox|jax)='
+	@$(BIN)/uv pip freeze --quiet --python $(NEWEST)/bin/python | grep -E '^(diffrax|equinox|jax)='
 	$(NEWEST)/bin/python -m pytest $(SHARED) -m "not slow and not examples"
 
 CLIENTS := $(VENV)/clients

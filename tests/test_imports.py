@@ -32,7 +32,7 @@ ROOT = Path(__file__).parents[1] / PACKAGE
 # A part of the package may import those of the lines above it. A part is a file or folder directly
 # under the package, and `diffrax_conserve` is its `__init__.py`.
 LAYERS = (
-    {"_custom_types", "_printing", "_options", "_constants", "_hashable"},
+    {"_custom_types", "_printing", "_options", "_constants", "_hashable", "_memory"},
     {"_tree", "_time", "_fast"},
     {"_manifold", "_large"},
     {"_balance", "_numerics"},
@@ -49,7 +49,6 @@ LAYERS = (
 
 # Packages that only these parts may import, because they are optional.
 CONFINED = {
-    "asdex": {"_large"},
     "hypothesis": {"testing"},
     "klujax": {"_large"},
     "matplotlib": {"reproduce", "_diagnostics"},
@@ -57,8 +56,6 @@ CONFINED = {
 
 # Private names of other packages that have no public equivalent: `(file, name)`. The file says why.
 PRIVATE_ALLOWED = {
-    ("_large/asdex_import.py", "jax._src.core"),
-    ("_large/asdex_import.py", "jax._src.core.ClosedJaxpr"),
     ("_solver/diffrax_private.py", "diffrax._term.WrapTerm"),
     ("_solver/diffrax_private.py", "diffrax._term.AdjointTerm"),
     ("_solver/diffrax_private.py", "diffrax.RESULTS._index_to_message"),

@@ -216,7 +216,7 @@ def alone(name, n, tolerances):
 
 def main():
     options = measuring.parser(__doc__, "large").parse_args()
-    about = measuring.machine("klujax", "asdex", "scikit-sundae")
+    about = measuring.machine("klujax", "scikit-sundae")
     measuring.print_machine(about)
     print(f"| problem | n | first call, s | MB | s for {ERROR:.0e} | IDA, s | ratio | steps |")
     print("|---|---|---|---|---|---|---|---|")

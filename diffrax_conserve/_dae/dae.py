@@ -22,6 +22,7 @@ from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.run_once import RunOnce
 from .._hashable import Hashable
 from .._manifold import Constraint, named_entries, slope_like
+from .._memory import Memory
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
 from .._numerics.metric import Diagonal
@@ -387,7 +388,8 @@ class DAE(Hashable):
 
     def _equations(self, t: RealScalarLike, y: Y, args: Args) -> Implicit:
         """The equations as a function of vectors, for states like `y`."""
-        size, given = ravel(y).size, len(self._names(t, y, args))
+        values = jax.eval_shape(lambda: self._values(t, y, y, args))
+        size, given = ravel(y).size, sum(x.size * _parts(x) for x in jtu.tree_leaves(values))
         which = next(x for x in ("residual", "algebraic", "f") if getattr(self, x) is not None)
         if which == "algebraic":
             z = ravel(y[1]).size
@@ -471,8 +473,7 @@ class DAEReport:
 
 # The searches, and the structures that were found, by the functions and the shapes. Both depend on
 # these alone, so that it does not matter which are known.
-_SEARCHES: dict[Any, Search] = {}
-_FOUND: dict[Any, Structure] = {}
+_SEARCHES, _FOUND = Memory(), Memory()
 
 
 # What JAX raises where a function asks for the value of a number that is traced.
@@ -493,11 +494,12 @@ def _structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
                 f"of {dae.structure.size} unknowns: call `at` with a state of this shape."
             )
         return dae.structure
-    key = tree_key((dae, y, args))
-    if key not in _FOUND:
+
+    def found() -> Structure:
         search = _search(dae, y, args)
-        _FOUND[key] = _found(dae, t, y, args, lambda: search.general((dae, args)))
-    return _FOUND[key]
+        return _found(dae, t, y, args, lambda: search.general((dae, args)))
+
+    return _FOUND(tree_key((dae, y, args)), found)
 
 
 def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structure:
@@ -542,15 +544,11 @@ def _search(dae: DAE, y: Y, args: Args) -> Search:
     # A Python float is traced, so that a solve in which JAX traces that number needs no search of
     # its own; unless the functions ask for its value.
     tree = dae, args
-    key = tree_key((lifted(tree), y))
-    if key not in _SEARCHES:
-        try:
-            _SEARCHES[key] = Search(equations, tree, ravel(y), mass, floats=True)
-        except _ASKED:
-            key = tree_key((tree, y))
-            if key not in _SEARCHES:
-                _SEARCHES[key] = Search(equations, tree, ravel(y), mass, floats=False)
-    return _SEARCHES[key]
+    search = ft.partial(Search, equations, tree, ravel(y), mass)
+    try:
+        return _SEARCHES(tree_key((lifted(tree), y)), lambda: search(floats=True))
+    except _ASKED:
+        return _SEARCHES(tree_key((tree, y)), lambda: search(floats=False))
 
 
 def _numbers(t: RealScalarLike, y: Y) -> tuple[Array, Array]:

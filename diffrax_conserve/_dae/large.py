@@ -43,7 +43,7 @@ class SparseMatrix:
         return self.matrix.shape
 
     def __matmul__(self, x: Array) -> Array:
-        """By gather and scatter, in which asdex sees the places, as it does not in a product."""
+        """By gather and scatter, of which the cost is that of the elements."""
         products = jnp.asarray(self.values, x.dtype) * x[self.columns]
         return jnp.zeros(self.shape[0], x.dtype).at[self.rows].add(products)
 

@@ -1,8 +1,8 @@
 """The structure of large equations, from sparse matrices.
 
 It is found as that of small ones, in `reduction.find_structure`: by elimination of the derivatives
-at numbers in general position. asdex finds their places, `_large.elimination` eliminates. What this
-can not do is refused with its reason, before it takes long.
+at numbers in general position. `_large.detection` finds their places, `_large.elimination`
+eliminates. What this can not do is refused with its reason, before it takes long.
 """
 
 # The types of scipy's sparse arrays are incomplete.
@@ -23,7 +23,7 @@ import scipy.sparse as sp
 from jaxtyping import Array
 
 from .._fast.run_once import RunOnce
-from .._large.asdex_import import asdex
+from .._large.detection import NotSparse, jacobian_places
 from .._large.elimination import TooFull, combinations, extended
 from .._large.klu import SparseJacobian
 from .large import Elimination, Large, SparseMatrix
@@ -45,15 +45,17 @@ class NotFound(Exception):
 
 @contextlib.contextmanager
 def _refusals() -> Iterator[None]:
-    """Gives what an elimination or asdex can not do as the reason why nothing was found."""
+    """Gives what an elimination can not do as the reason why nothing was found."""
     try:
         yield
     except TooFull:
         raise NotFound(
             "the matrices of their derivatives fill in too much when they are eliminated"
         ) from None
-    except NotImplementedError as error:
-        raise NotFound(f"asdex, which finds the places of derivatives, says: {error}") from None
+    except NotSparse:
+        raise NotFound(
+            "nearly all equations depend on nearly all unknowns, as far as their program tells"
+        ) from None
 
 
 @_refusals()
@@ -335,8 +337,8 @@ class _Places:
             return fn(numbers, t, *pair)
 
         zeros, others = np.zeros(n), [np.asarray(self.numbers[i]) for i in self.unknown]
-        found = asdex().jacobian_sparsity(of_one, zeros, np.zeros(()), zeros, *others)
-        return SparseJacobian(np.asarray(found.rows), np.asarray(found.cols), found.shape)
+        closed = jax.make_jaxpr(of_one)(zeros, np.zeros(()), zeros, *others)
+        return SparseJacobian(*jacobian_places(closed), (closed.out_avals[0].shape[0], n))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
-from .._large.klu import Places, SparseJacobian
+from .._large.klu import Places, RealFactor, SparseJacobian
 from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_step
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
@@ -55,10 +55,14 @@ class _Factored(NamedTuple):
         one = scaled, jnp.zeros(1, jnp.int32)
         return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns, jacobian)
 
-    def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
+    def correction(self, residual: Float[Array, " m"], after: Any = None) -> Float[Array, " m"]:
+        del after
         right = residual / self.rows
         one = right.size == 1
         return -(right / self.lu[0][0] if one else lu_solution(self.lu, right)) / self.columns
+
+    def freed(self, last: Float[Array, " m"]) -> Float[Array, " m"]:
+        return last
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
@@ -74,16 +78,21 @@ class _Factored(NamedTuple):
 
 
 class _SparseFactored(NamedTuple):
-    """As `_Factored`, for many unknowns. KLU factors again in each solve."""
+    """As `_Factored`, for many unknowns. A correction is computed `after` another, and the factor
+    is freed with the last."""
 
     places: Places
     values: Float[Array, " k"]
+    factor: RealFactor
 
-    def correction(self, residual: Float[Array, " m"]) -> Float[Array, " m"]:
-        return -self.places.solve_regular(self.values, residual)
+    def correction(self, residual: Float[Array, " m"], after: Any = None) -> Float[Array, " m"]:
+        return -self.factor.solve(residual, after)
+
+    def freed(self, last: Float[Array, " m"]) -> Float[Array, " m"]:
+        return self.factor.freed(last, last)[0]
 
     def regular(self) -> Bool[Array, ""]:
-        return ~jnp.any(jnp.isnan(self.values))
+        return self.factor.is_regular
 
     def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
         rows, columns, slopes = self.places.rows, self.places.columns, jnp.abs(self.values)
@@ -101,8 +110,7 @@ class SparseNewton:
 
     def at(self, residual: Residual, z: Float[Array, " m"]) -> _SparseFactored:
         values = self.found.values(residual, z)
-        values = jnp.where(self.places.is_regular(values), values, jnp.nan)
-        return _SparseFactored(self.places, values)
+        return _SparseFactored(self.places, values, RealFactor(self.places, values))
 
     def at_roundoff(self, residual: Residual, z: Float[Array, " m"]) -> Bool[Array, ""]:
         sizes = self.places.matvec(jnp.abs(self.found.values(residual, z)), jnp.abs(z))
@@ -165,7 +173,7 @@ def at_rest_near(
         factored = linearised(residual, z)
         step = factored.correction(residual(z))
         trial = z + share * step
-        after = factored.correction(residual(trial))
+        after = factored.freed(factored.correction(residual(trial), step))
         size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.

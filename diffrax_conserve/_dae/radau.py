@@ -59,8 +59,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
 
     From 100 unknowns on, in float64 on a CPU, the linear systems are sparse: which elements of the
     Jacobian can differ from zero is found when the solve is traced, and KLU solves them. That takes
-    the packages of `pip install 'diffrax-conserve[sparse]'`. Without them, in float32 and on a GPU,
-    or if a quarter of the elements can differ from zero, the systems are dense, which takes $n^3$
+    the package of `pip install 'diffrax-conserve[sparse]'`. Without it, in float32 and on a GPU, or
+    if a quarter of the elements can differ from zero, the systems are dense, which takes $n^3$
     operations in a step. A singular matrix ends Newton's method, as if it had not converged.
 
     Where the solution oscillates, as in a circuit, the local error does too, and a step that

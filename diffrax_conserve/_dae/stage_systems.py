@@ -18,9 +18,9 @@ from .._constants import MIN_KLU, WARN_DENSE
 from .._large.klu import (
     Factor,
     Places,
+    RealFactor,
     SparseJacobian,
     available,
-    is_bounded,
     sparse_jacobian,
     why_not,
 )
@@ -66,7 +66,7 @@ class SparseSystems(NamedTuple):
 
     @property
     def stages_solution(self) -> Callable[[Array, Array], Array]:
-        return self.places.of_stages.solve
+        return self.places.stages_solution
 
     @property
     def stages_jacobian(self) -> Callable[[Any], Any]:
@@ -80,25 +80,19 @@ class SparseSystems(NamedTuple):
 
     def solvers(self, real: Any, pair: Any) -> tuple[Solve, Solve, Freed]:
         places = self.places.of_both
-        if places.permutation is None:
-            nan = lambda b, after=None: jnp.full_like(b, jnp.nan)  # noqa: E731
-            return nan, nan, lambda last, *results: results
         # The factor of the test is that of the real matrix too, whose solution is the real part.
-        scaled, heights, widths, b = places.in_general_position(real * self.by_slope + self.by_y)
-        first = Factor(places, scaled)
-        regular = is_bounded(first.solve(b))
+        first = RealFactor(places, real * self.by_slope + self.by_y)
+        if places.permutation is None:
+            return first.solve, first.solve, first.freed
         # If a matrix is singular for one share, it is for all: no pencil is so for one that a
         # step size happens to have.
-        known = jnp.where(regular, self.by_y, jnp.nan)
+        known = jnp.where(first.is_regular, self.by_y, jnp.nan)
         second = Factor(places, pair * self.by_slope + known)
-
-        def solve(b: Array, after: Array = regular) -> Array:
-            return first.solve(b / heights, after).real / widths
 
         def freed(last: Array, *results: Array) -> tuple[Array, ...]:
             return first.freed(last, *second.freed(last, *results))
 
-        return solve, second.solve, freed
+        return first.solve, second.solve, freed
 
 
 class _Together:
@@ -137,15 +131,14 @@ class _Together:
         places = Places(rows, columns, 3 * n)
         return SparseJacobian(places.rows, places.columns, (3 * n, 3 * n)), places
 
-    @property
-    def of_stages(self) -> Places:
-        return self._stages[1]
+    def stages_solution(self, values: Array, b: Array) -> Array:
+        return self._stages[1].solve(values, b)
 
     def stages_jacobian(self, residual: Callable[[Array], Array]) -> Callable[[Array], Array]:
         return lambda x: self._stages[0].values(residual, x)
 
 
-@ft.cache
+@ft.lru_cache(256)
 def _together(by_y: SparseJacobian, by_slope: SparseJacobian, size: int) -> _Together:
     return _Together(by_y, by_slope, size)
 

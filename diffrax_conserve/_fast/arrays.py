@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from .jaxprs import num_equations, outputs, walk
-from .scalars import BY_INDICES, ELEMENTWISE, KNOWN, MOVES, moved_elements
+from .scalars import BY_INDICES, ELEMENTWISE, KNOWN, MOVES, moved_elements, without_sharding
 
 # A choice of so many pieces at most is made of slices, not by indices.
 _PIECES = 8
@@ -220,8 +220,8 @@ class _Program:
         xs, out = [self.values[i] for i in row], [var.aval for var in eqn.outvars]
         whole = all(x.number is not None or x.known is not None for x in xs)
         if whole and len(out) == 1 and out[0].dtype.kind in "iub" and name != "gather":
-            found = _computed(name, params, xs)
-            if found is not None:
+            found = computed(eqn, [_array(x) for x in xs])  # pyright: ignore
+            if found is not None and not isinstance(found, list):
                 return [self.constant(np.asarray(found).astype(out[0].dtype))]
         match name:
             case "copy":
@@ -406,9 +406,9 @@ def _key(eqn: Any) -> Any:
     return eqn.primitive.name, params
 
 
-def _computed(name: str, params: Any, xs: list[_Value]) -> np.ndarray | None:
-    """The result of known integers, as indices are, if it can be computed here."""
-    arrays = [_array(x) for x in xs]
+def computed(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray | list[np.ndarray] | None:
+    """The results of known arrays, as of indices, if they can be computed here."""
+    name, params = eqn.primitive.name, eqn.params
     if name == "iota":
         shape, axis = params["shape"], params["dimension"]
         each = np.arange(shape[axis]).reshape([-1 if k == axis else 1 for k in range(len(shape))])
@@ -419,7 +419,5 @@ def _computed(name: str, params: Any, xs: list[_Value]) -> np.ndarray | None:
         with np.errstate(all="ignore"):
             return KNOWN[name](*arrays)
     if name in MOVES:
-        given = {k: v for k, v in params.items() if v is not None and "sharding" not in k}
-        found = MOVES[name](*arrays, **given)
-        return None if isinstance(found, list) else found
+        return MOVES[name](*arrays, **without_sharding(params))
     return None

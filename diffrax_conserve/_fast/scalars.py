@@ -314,6 +314,26 @@ def moved_elements(
     return tuple(np.broadcast_to(x, moved) for x in at), np.broadcast_to(inside, moved)
 
 
+def without_sharding(params: Any) -> dict[str, Any]:
+    """The parameters of a primitive that matter here: those that are `None` do not, nor those that
+    tell on which device something is."""
+    return {k: v for k, v in params.items() if v is not None and "sharding" not in k}
+
+
+def moved_by(
+    eqn: Any, shape: Sequence[int], update_shape: Sequence[int], indices: list[np.ndarray]
+) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
+    """Which elements of an operand of this shape an equation of `BY_INDICES` takes or puts, as
+    `moved_elements`, and which of them count."""
+    name, params, axes = eqn.primitive.name, eqn.params, tuple(range(len(shape)))
+    dynamic, takes = name.startswith("dynamic"), name in TAKES
+    numbers = (axes, (), axes, (), ()) if dynamic else params["dimension_numbers"]
+    starts = np.stack(indices, -1) if dynamic else indices[0]
+    moved = eqn.outvars[0].aval.shape if takes else update_shape
+    at, inside = moved_elements(shape, starts, numbers, moved)
+    return at, inside | (params.get("mode") != lax.GatherScatterMode.FILL_OR_DROP)
+
+
 # The primitives that only move elements, as functions that move their places by numpy. JAX itself
 # could do that too, but it would compile each of them for each shape, which takes 15 to 50 ms.
 MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
@@ -328,6 +348,7 @@ MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "split": lambda x, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
     "squeeze": lambda x, dimensions: x.squeeze(dimensions),
     "stack": lambda *xs, axis: np.stack(xs, axis),
+    "tile": lambda x, reps: np.tile(x, reps),
     "transpose": lambda x, permutation: x.transpose(permutation),
     "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
 }
@@ -340,6 +361,7 @@ BY_INDICES = {
     "scatter": (1, 2),
     "scatter-add": (1, 2),
 }
+TAKES = frozenset({"dynamic_slice", "gather"})
 # What is computed at once for known numbers. Indices need all of it: JAX replaces -1 by the last
 # place before it uses them.
 KNOWN: dict[str, Callable[..., Any]] = {
@@ -431,13 +453,7 @@ class _Program:
         name, params = eqn.primitive.name, eqn.params
         if eqn.effects or any(_is_key(var.aval) for var in eqn.outvars):
             raise _NotWrittenOut
-        # Parameters that are `None`, and those that tell on which device something is, do not
-        # matter here.
-        given = {
-            key: value
-            for key, value in params.items()
-            if value is not None and key not in ("sharding", "out_sharding")
-        }
+        given = without_sharding(params)
         dtype = eqn.outvars[0].aval.dtype if eqn.outvars else None
         if name in MOVES:
             moved = MOVES[name](*inputs, **given)
@@ -509,23 +525,17 @@ class _Program:
         indices = [x for x in found if x is not None]
         if len(indices) < len(found):
             return self._as_it_is(eqn, inputs)
-        dynamic, takes = name.startswith("dynamic"), name in ("gather", "dynamic_slice")
-        axes = tuple(range(operand.ndim))
-        numbers = (axes, (), axes, (), ()) if dynamic else params["dimension_numbers"]
-        updates = inputs[1 if dynamic else 2] if not takes else operand
-        moved = eqn.outvars[0].aval.shape if takes else updates.shape
-        starts = np.stack(indices, -1) if dynamic else indices[0]
-        at, inside = moved_elements(operand.shape, starts, numbers, moved)
-        outside = params.get("mode") == lax.GatherScatterMode.FILL_OR_DROP and not np.all(inside)
-        if takes and not outside:
+        takes, updates = name in TAKES, inputs[1 if name.startswith("dynamic") else -1]
+        at, counted = moved_by(eqn, operand.shape, updates.shape, indices)
+        if takes and np.all(counted):
             return [operand[at]]
         if takes:
             filling = params["fill_value"]
             if filling is None and not jnp.issubdtype(dtype, jnp.inexact):
                 return self._as_it_is(eqn, inputs)
             filling = np.asarray(np.nan if filling is None else filling, dtype)
-            return [np.where(inside, operand[at], self._constant(filling))]
-        out, counted = operand.copy(), inside | (not outside)
+            return [np.where(counted, operand[at], self._constant(filling))]
+        out = operand.copy()
         at, updates = tuple(x[counted] for x in at), updates[counted]
         if name != "scatter-add":
             out[at] = updates

@@ -26,9 +26,9 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
 from .._constants import DENSE_ROW_RATIO, ROUNDOFF
+from .._memory import Memory
 from .._tree import eps_of, irregular_weights
-from .asdex_import import asdex
-from .detection import constants_of, content_key, jacobian_places
+from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
 
 # A perturbation in the imaginary part of a real matrix. Its square is below the roundoff of any
 # element, so that it changes no real part.
@@ -63,13 +63,12 @@ def available(dtype: Any) -> bool:
 
 @ft.cache
 def why_not() -> str:
-    """Why the packages cannot be imported, and what to do; empty if they can be."""
+    """Why the package cannot be imported, and what to do; empty if it can be."""
     try:
-        asdex()
         klujax()
     except Exception as error:  # missing, or made for another version of jax
         return (
-            f"the packages for sparse ones cannot be imported ({type(error).__name__}: {error}): "
+            f"the package for sparse ones cannot be imported ({type(error).__name__}: {error}): "
             "`pip install 'diffrax-conserve[sparse]'`."
         )
     return ""
@@ -81,7 +80,8 @@ class Places:
 
     def __init__(self, rows: Any, columns: Any, size: int):
         numbers = np.asarray(columns, np.int64) * size + np.asarray(rows, np.int64)
-        self.size, self.numbers = size, np.unique(numbers)
+        numbers = np.sort(numbers)  # `numpy.unique` can take fifty times as long
+        self.size, self.numbers = size, numbers[np.diff(numbers, prepend=-1) > 0]
         self.rows = (self.numbers % size).astype(np.int32)
         self.columns = (self.numbers // size).astype(np.int32)
         self._key = size, self.numbers.tobytes()
@@ -195,7 +195,7 @@ class Places:
         return Places(rows, columns, 2 * n), np.lexsort((rows, columns))
 
 
-# The orders in which KLU eliminates. Compiled programs contain their addresses, so they are kept.
+# The orders in which KLU eliminates. Compiled programs contain their addresses, so all are kept.
 _ANALYZED: dict[Places, Any] = {}
 
 
@@ -256,6 +256,27 @@ class Factor:
         never = jnp.any(last > jnp.inf).astype(jnp.uint64)
         done = _kept().free.bind(self._address, never) == 1
         return tuple(jnp.where(done, x, jnp.nan) for x in results)
+
+
+class RealFactor:
+    """The factor of a real matrix with the tiny imaginary parts, in units of its rows and columns,
+    which tells whether the matrix is regular too. Solutions are NaN if it is not."""
+
+    def __init__(self, places: Places, values: Float[Array, " k"]):
+        self._factor, self.is_regular = None, jnp.asarray(False)
+        if places.permutation is not None:
+            scaled, self._heights, self._widths, b = places.in_general_position(values)
+            self._factor = Factor(places, scaled)
+            self.is_regular = is_bounded(self._factor.solve(b))
+
+    def solve(self, b: Float[Array, " n"], after: Any = None) -> Float[Array, " n"]:
+        if self._factor is None:
+            return jnp.full_like(b, jnp.nan)
+        after = self.is_regular if after is None else after
+        return self._factor.solve(b / self._heights, after).real / self._widths
+
+    def freed(self, last: Array, *results: Array) -> tuple[Array, ...]:
+        return results if self._factor is None else self._factor.freed(last, *results)
 
 
 class _Calls(NamedTuple):
@@ -321,50 +342,59 @@ class SparseJacobian:
 
     def __init__(self, rows: np.ndarray, columns: np.ndarray, shape: tuple[int, int]):
         self.shape, order = shape, np.lexsort((rows, columns))
-        rows, columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
+        self.rows, self.columns = rows[order].astype(np.int64), columns[order].astype(np.int64)
+
+    @property
+    def num_passes(self) -> tuple[int, int]:
+        return self._passes[1], len(self.dense_rows)
+
+    @property
+    def dense_rows(self) -> np.ndarray:
+        return self._passes[2]
+
+    @ft.cached_property
+    def _passes(self) -> tuple[np.ndarray, int, np.ndarray, np.ndarray]:
+        """The colours of the columns, and their number; the dense rows; and where each element is
+        among the results of all passes. Not all places that are found are differentiated."""
+        rows, columns, shape = self.rows, self.columns, self.shape
         counts = np.bincount(rows, minlength=shape[0])
         # There are at least as many colours as elements in a row, and few rows take fewer passes.
         widest = np.max(counts, initial=0)
         dense = (counts > DENSE_ROW_RATIO * max(1, np.median(counts))) | (widest > shape[0])
         few = ~dense[rows]
-        found = asdex().SparsityPattern.from_coo(rows[few], columns[few], shape)
-        colours, number = asdex().color_cols(found) if np.any(few) else (np.zeros(shape[1], int), 0)
-        self.rows, self.columns, self.dense_rows = rows, columns, np.flatnonzero(dense)
-        self.num_passes = int(number), len(self.dense_rows)
-        self._colours = np.asarray(colours)
-        by_colour = self._colours[columns] * shape[0] + rows
+        colours, number = coloured(columns[few], rows[few], shape[1])
+        by_colour = colours[columns] * shape[0] + rows
         by_row = number * shape[0] + (np.cumsum(dense) - 1)[rows] * shape[1] + columns
-        self._taken = np.where(few, by_colour, by_row)
+        return colours, number, np.flatnonzero(dense), np.where(few, by_colour, by_row)
 
     def values(self, fn: Callable[[Array], Array], x: Float[Array, " n"]) -> Float[Array, " k"]:
         """The values of the elements, in the order of the places."""
-        colours, dense = self.num_passes
-        seeds = jnp.asarray(np.arange(colours)[:, None] == self._colours, x.dtype)
+        colours, number, dense_rows, taken = self._passes
+        seeds, dense = jnp.asarray(np.arange(number)[:, None] == colours, x.dtype), len(dense_rows)
         passes = [jax.vmap(lambda seed: jax.jvp(fn, (x,), (seed,))[1])(seeds).reshape(-1)]
         if dense:
             vjp = jax.vjp(fn, x)[1]
             rows = jnp.zeros((dense, jax.eval_shape(fn, x).size), x.dtype)
-            rows = rows.at[np.arange(dense), self.dense_rows].set(1)
+            rows = rows.at[np.arange(dense), dense_rows].set(1)
             passes.append(jax.vmap(lambda row: vjp(row)[0])(rows).reshape(-1))
-        return jnp.concatenate(passes)[self._taken]
+        return jnp.concatenate(passes)[taken]
 
 
 def sparse_jacobian(fn: Callable[[Array], Array], x: Any) -> SparseJacobian | None:
     """The places of the Jacobian of a function of a vector like `x`; `None` if they cannot be
     found. Constants of the function that JAX traces may have any values."""
     traced = jax.make_jaxpr(fn)(jax.ShapeDtypeStruct(x.shape, x.dtype))
-    key = str(traced.jaxpr), *map(content_key, constants_of(traced))
-    if key not in _KNOWN:
+
+    def found() -> SparseJacobian | None:
         with jax.ensure_compile_time_eval():
             try:
-                rows, columns = jacobian_places(traced, x)
-            except NotImplementedError:  # an operation that asdex does not know
-                _KNOWN[key] = None
-            else:
-                shape = traced.out_avals[0].shape[0], x.shape[0]
-                _KNOWN[key] = SparseJacobian(rows, columns, shape)
-    return _KNOWN[key]
+                rows, columns = jacobian_places(traced)
+            except NotSparse:
+                return None
+        return SparseJacobian(rows, columns, (traced.out_avals[0].shape[0], x.shape[0]))
+
+    return _KNOWN((str(traced.jaxpr), *map(content_key, constants_of(traced))), found)
 
 
 # The Jacobians that were found, by their functions.
-_KNOWN: dict[Any, SparseJacobian | None] = {}
+_KNOWN = Memory()

@@ -36,8 +36,8 @@ from .._constants import (
     MAX_UNROLLED,
     MIN_SPARSE,
 )
-from .asdex_import import asdex, reason
-from .detection import constants_of, content_key, jacobian_places
+from .._memory import Memory
+from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
 from .klu import Places, available
 
 # A dense Jacobian of this many bytes, 256 MiB, is announced before it is allocated.
@@ -203,8 +203,7 @@ def _coloured(
     for size, (rows, columns) in found:
         is_dense = dense[first : first + size]
         rows, columns = rows[~is_dense[rows]], columns[~is_dense[rows]]
-        kept = asdex().SparsityPattern.from_coo(rows, columns, (size, shape[1]))
-        colour, number = asdex().color_rows(kept)
+        colour, number = coloured(rows, columns, size)
         colour = np.where(is_dense, number + np.cumsum(is_dense) - 1, colour)
         elements.append((first + rows, columns, len(of_dense) + colour[rows]))
         of_dense += [False] * number + [True] * int(np.sum(is_dense))
@@ -222,26 +221,19 @@ def pattern_of(
     m, n = sum(sizes), y.size
     if m < MIN_SPARSE:
         return None
-    try:
-        asdex()
-    except Exception as error:  # private names of jax that are gone raise errors of any kind
-        warnings.warn(
-            f"The manifold has {m} constraints. Their Jacobian is treated as dense, because "
-            f"{reason(error)}",
-            stacklevel=2,
-        )
-        return None
     # Equal functions have equal jaxprs and equal constants.
     traced = [jax.make_jaxpr(part)(y) for part in parts]
     keys = tuple((str(x.jaxpr), *map(content_key, constants_of(x))) for x in traced)
-    if keys not in _KNOWN:
+
+    def found() -> Pattern | None:
         with jax.ensure_compile_time_eval():
             try:
-                found = [jacobian_places(x, y) for x in traced]
-                _KNOWN[keys] = _sparse((m, n), list(zip(sizes, found, strict=True)), y.dtype)
-            except NotImplementedError:  # an operation that asdex does not know
-                _KNOWN[keys] = None
-    pattern = _KNOWN[keys]
+                places = map(jacobian_places, traced)
+                return _sparse((m, n), list(zip(sizes, places, strict=True)), y.dtype)
+            except NotSparse:
+                return None
+
+    pattern = _KNOWN(keys, found)
     if pattern is None and m * n * y.dtype.itemsize > _LARGE:
         warnings.warn(
             f"The Jacobian of the {m} constraints is not sparse, or its pattern is not known when "
@@ -258,7 +250,7 @@ def pattern_of(
 
 
 # The patterns that were found, by their functions. Detection takes seconds for large systems.
-_KNOWN: dict[Any, Pattern | None] = {}
+_KNOWN = Memory()
 
 
 def _sparse(shape: tuple[int, int], found: list[Any], dtype: Any) -> Pattern | None:

@@ -1,13 +1,11 @@
 """Many constraints: their sparse Jacobian against a dense one, in each order of blocks."""
 
 import dataclasses
-import sys
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
-import jax._src.core
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -16,7 +14,7 @@ from jaxtyping import Array
 
 import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
-from diffrax_conserve._large import asdex_import, sparse
+from diffrax_conserve._large import sparse
 from diffrax_conserve._numerics.metric import Diagonal
 from diffrax_conserve._numerics.problem import Problem, problem_of
 
@@ -164,54 +162,6 @@ def test_what_is_not_sparse_is_told(monkeypatch: pytest.MonkeyPatch):
     chosen = lambda args: dfc.project(pick, jnp.full(50, 1.1), args=args)  # noqa: E731
     with pytest.warns(UserWarning, match=r"GiB\. A function that selects .* close over it"):
         jax.eval_shape(chosen, jnp.arange(NUM))
-
-
-@pytest.fixture
-def asdex_anew(monkeypatch):
-    """asdex is imported again, and afterwards as before."""
-    for name in [name for name in sys.modules if name.split(".")[0] == "asdex"]:
-        monkeypatch.delitem(sys.modules, name)
-    asdex_import.asdex.cache_clear()
-    yield
-    asdex_import.asdex.cache_clear()
-
-
-def warning_of_spins() -> str:
-    """The one warning about many spins, which are projected all the same. The constraint is a new
-    one, because what was traced is not traced again."""
-    spins = dfc.Constraint(lambda t, y, args: jnp.sum(y**2, axis=1) - 1)
-    with pytest.warns(UserWarning, match="treated as dense") as told:
-        jax.eval_shape(lambda y: dfc.project(spins, y), jnp.ones((NUM, 3)))
-    return str(told.pop().message)
-
-
-def test_without_asdex_it_is_told_what_to_install(asdex_anew, monkeypatch):
-    monkeypatch.setitem(sys.modules, "asdex", None)
-    told = warning_of_spins()
-    assert "is missing: `pip install '.[sparse]'`" in told
-
-
-@pytest.mark.parametrize(
-    "source",
-    ["from jax.numpy import moon", "import moon", "import jax\njax.moon", "raise OSError('moon')"],
-)
-def test_an_asdex_that_cannot_be_imported_is_not_missing(asdex_anew, monkeypatch, tmp_path, source):
-    """The cause is told, and the versions of both packages."""
-    (tmp_path / "asdex").mkdir()
-    (tmp_path / "asdex" / "__init__.py").write_text(source)
-    (tmp_path / "asdex-7.8.dist-info").mkdir()
-    (tmp_path / "asdex-7.8.dist-info" / "METADATA").write_text("Name: asdex\nVersion: 7.8\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    told = warning_of_spins()
-    assert "missing" not in told
-    for words in ("asdex 7.8", f"cannot be imported with jax {jax.__version__}", "moon"):
-        assert words in told
-
-
-def test_what_is_lent_to_asdex_is_taken_back(asdex_anew):
-    before = set(vars(jax._src.core))
-    asdex_import.asdex()
-    assert set(vars(jax._src.core)) == before
 
 
 @pytest.mark.slow
