@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
 from .._large.klu import Places, RealFactor, SparseJacobian
-from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_step
+from .._numerics.iterate import Solved, any_lane, iterate, left_after_step, where_active
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import DenseRows
@@ -195,7 +195,7 @@ def at_rest_near(
         longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
         share = jnp.where(better, longer, shorter)
         at_rest = (converged | (~going & (before < jnp.inf))) & factored.regular()
-        return keep_done(tests_left, (z, share, converged), now), left_after_step(
+        return where_active(tests_left, (z, share, converged), now), left_after_step(
             at_rest, going, tests_left
         )
 

@@ -120,26 +120,26 @@ def written(
 def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
     """`run(given, is_batched)` as a function of `given`.
 
-    Both forms are jitted, so that JAX traces each once, although it batches the loop over the steps
-    of a solve several times. The results of `run` are arrays.
+    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
+    steps of a solve several times. `run` returns arrays.
     """
 
     def call(given: Any) -> Any:
         arrays, static = eqx.partition(given, eqx.is_array)
 
-        def form(is_batched: bool) -> Callable[[Any], Any]:
+        def variant(is_batched: bool) -> Callable[[Any], Any]:
             return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
 
-        alone, lane = jax.custom_batching.custom_vmap(form(False)), form(True)
+        unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
 
-        @alone.def_vmap
+        @unbatched.def_vmap
         def batched(size: int, axes: Any, arrays: Any) -> Any:
             del size
             (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
             out = jax.vmap(lane, (axes,))(arrays)
             return out, jtu.tree_map(lambda x: True, out)
 
-        return alone(arrays)
+        return unbatched(arrays)
 
     return call
 

@@ -26,7 +26,7 @@ from .._hashable import Hashable
 from .._interpolation import AsArrays
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, iterate, keep_done, left_after_test
+from .._numerics.iterate import Solved, iterate, left_after_test, where_active
 from .._numerics.linear import Solve, iterative_refinement
 from .._numerics.metric import Diagonal, broadcast_option
 from .._numerics.problem import Problem, problem_of
@@ -355,7 +355,7 @@ def _shake(
         g = _barrier(problem.residual(_barrier(position(x))))
         level, _ = problem.level(g, scale)
         tests_left = left_after_test(level, tests_left)
-        return keep_done(tests_left, x - change(g), x), tests_left
+        return where_active(tests_left, x - change(g), x), tests_left
 
     return iterate(advance, guess, max_steps=max_steps)
 

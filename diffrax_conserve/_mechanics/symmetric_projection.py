@@ -18,7 +18,7 @@ from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScala
 from .._interpolation import AsArrays
 from .._manifold import check_manifold
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, any_lane, iterate, keep_done, left_after_test
+from .._numerics.iterate import Solved, any_lane, iterate, left_after_test, where_active
 from .._numerics.problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -274,7 +274,7 @@ def _solved(
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)
-        return keep_done(tests_left, moved, now), tests_left
+        return where_active(tests_left, moved, now), tests_left
 
     found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
     y, multiplier, candidate, result = found.y

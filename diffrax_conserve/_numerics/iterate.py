@@ -1,9 +1,9 @@
 """The iterations that lead to the manifold: one loop, and the steps that it can make.
 
-All are Newton's method, for at least as many unknowns as equations. They differ in their steps, so
-a step is a function of the unknowns and of the number of tests that are left, and the loop around
-it is written once, in `iterate`. In this file a step is one of an iteration, unless it is called a
-step of the solver.
+All are variants of Newton's method, for at most as many equations as unknowns. They differ in their
+steps, so a step is a function of the unknowns and of the number of tests that are left, and the
+loop around it is written once, in `iterate`. In this file a step is one of an iteration, unless it
+is called a step of the solver.
 
 - `simplified_newton` is for candidates as near as the local error of a solver's step (Hairer,
   Lubich and Wanner, IV.4, (4.4) to (4.6)). It looks for multipliers `λ` such that `y = ŷ + S Uᵀ λ`
@@ -12,11 +12,12 @@ step of the solver.
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
   last state, so that the iteration is Newton's method; for more it is evaluated at the candidate.
-- `projected_newton` is `simplified_newton` within bounds.
-- `damped_newton` is for starts far away. Each step is the shortest, in the metric, that solves the
-  equations linearised at the last state (P. Deuflhard, *Newton Methods for Nonlinear Problems*,
-  Springer 2004, Section 4.4). A step that increases the largest residual, or leaves the domain of a
-  function, is shortened until it does not.
+- `projected_newton` keeps a state within bounds. It is a semismooth Newton method along given
+  directions, with a line search.
+- `damped_newton` is for starts far away. Without given directions each step is the shortest, in the
+  metric, that solves the equations linearised at the last state (P. Deuflhard, *Newton Methods for
+  Nonlinear Problems*, Springer 2004, Section 4.4). A step that increases the largest residual, or
+  leaves the domain of a function, is shortened until it does not.
 """
 
 import functools as ft
@@ -151,8 +152,8 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[
     return any_lane(jnp.any(flags)), False
 
 
-def keep_done(tests_left: Array, moved: Any, y: Any) -> Any:
-    """The moved unknowns where the iteration goes on, and the others where it is done."""
+def where_active(tests_left: Array, moved: Any, y: Any) -> Any:
+    """The moved unknowns where the iteration goes on, and the old ones where it is done."""
     return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
 
 
@@ -169,6 +170,7 @@ def simplified_newton(
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
     For up to four constraints they are `directions` if these are given, and otherwise, after
     `FROZEN_STEPS` iterations, the gradients at the current state."""
+    assert directions is None or problem.magnitude.size <= MAX_UNROLLED
     if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
     if problem.magnitude.size > MAX_UNROLLED:
@@ -204,9 +206,8 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
         rows, to_correct = permuted(order, rows.matrix), permuted(order, to_correct / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
-        # `left_after_test` sets the number of tests to two when it asks for a step that polishes,
-        # so the steps are counted by its value before. If that step leaves the tolerance, the next
-        # one is along the gradients at its state.
+        # We count by the number before `left_after_test`, which may set it to two for a step that
+        # polishes. If that step leaves the tolerance, the next one is along the current gradients.
         frozen = tests_left > max_steps + 1 - FROZEN_STEPS
         current = jnp.where(frozen, fixed, rows) if may_switch else fixed
         tests_left = left_after_test(level, tests_left)
@@ -224,11 +225,11 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
             current, to_correct, pivot_tolerance=pivot_tolerance, presorted=True
         )
         newton_point = y - problem.factor.to_state(change)
-        return keep_done(tests_left, newton_point, y), tests_left
+        return where_active(tests_left, newton_point, y), tests_left
 
     if is_batched:
         tests_left = initial_tests(max_steps)
-        # In arrays, if that would be too large.
+        # Unchanged, if the loop would be too large in scalars.
         invariants_of, advance, y = loop_in_scalars(loop_invariants, advance, candidate, tests_left)
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
@@ -272,7 +273,7 @@ def _with_frozen_matrix(
             return y - each(lambda problem, x: problem.factor.to_state(x))(change), kept
 
         moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, at_candidate))
-        return (keep_done(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
+        return (where_active(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
 
     candidate = lax.optimization_barrier(candidate)
     like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
@@ -310,7 +311,7 @@ def _with_frozen_jacobian(
         tests_left = left_after_test(level, tests_left)
         move = lambda: y - combination(solve(to_correct / row_scales) / row_scales)  # noqa: E731
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
-        return keep_done(tests_left, moved, y), tests_left
+        return where_active(tests_left, moved, y), tests_left
 
     y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
     return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
@@ -319,7 +320,7 @@ def _with_frozen_jacobian(
 # ---- For starts far away ----
 
 
-class _Descent(NamedTuple):
+class _DampedState(NamedTuple):
     """The state to be tested, and the best one so far with its largest residual, relative to the
     scales at the start. A scale grows with the state, so that by their own scales residuals
     far away would look smaller than they are."""
@@ -344,15 +345,15 @@ def damped_newton(
     case the result depends on the path.
     """
 
-    def advance(now: _Descent, tests_left: Array) -> tuple[_Descent, Array]:
-        y, first = now.y, now.largest == jnp.inf
+    def advance(now: _DampedState, tests_left: Array) -> tuple[_DampedState, Array]:
+        y, is_first = now.y, now.largest == jnp.inf
         g, jacobian = lax.optimization_barrier(problem.linearise(y))
         scale_at_y = problem.scale(jacobian, y)
         level, to_correct = problem.level(g, scale_at_y)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
-        level = jnp.where(first, level, jnp.maximum(level, ABOVE_TOLERANCE))
+        level = jnp.where(is_first, level, jnp.maximum(level, ABOVE_TOLERANCE))
         tests_left = left_after_test(level, tests_left, polish=polish)
-        scale = jnp.where(first, scale_at_y, now.scale)
+        scale = jnp.where(is_first, scale_at_y, now.scale)
         residuals = jnp.abs(relative_to_scale(g, scale))
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
         row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
@@ -362,10 +363,10 @@ def damped_newton(
         backtracked = now.best + BACKTRACKING_FACTOR * (y - now.best)
         best = jnp.where(is_smaller, y, now.best)
         largest = jnp.where(is_smaller, jnp.max(residuals), now.largest)
-        moved = keep_done(tests_left, jnp.where(is_smaller, newton_point, backtracked), y)
-        return _Descent(moved, best, largest, scale), tests_left
+        moved = where_active(tests_left, jnp.where(is_smaller, newton_point, backtracked), y)
+        return _DampedState(moved, best, largest, scale), tests_left
 
-    begin = _Descent(start, start, jnp.full_like(start[0], jnp.inf), problem.magnitude)
+    begin = _DampedState(start, start, jnp.full_like(start[0], jnp.inf), problem.magnitude)
     found = iterate(advance, begin, max_steps=max_steps)
     return found._replace(y=found.y.y)
 
@@ -394,7 +395,7 @@ def projected_newton(
         multiplier = rows.gram(directions).solve(g / row_scales)
         change = problem.factor.to_state(directions.rmatvec(multiplier))
         step_fraction = _line_search(problem, z, multiplier, change, tests_left > 0)
-        return keep_done(tests_left, z - step_fraction * change, z), tests_left
+        return where_active(tests_left, z - step_fraction * change, z), tests_left
 
     return iterate(advance, start, max_steps=max_steps)
 
@@ -403,20 +404,20 @@ def _line_search(
     problem: Problem, z: Array, multiplier: Array, change: Array, goes_on: Array
 ) -> Array:
     """The fraction of a Newton step at which the convex function is least. It is found by bisection
-    of the directional derivative, `descent`, whose sign tells the side of the minimum."""
+    of the directional derivative, `slope`, whose sign tells the side of the minimum."""
 
-    def descent(step_fraction: Array | float) -> Array:
+    def slope(step_fraction: Array | float) -> Array:
         return jnp.sum(multiplier * problem.residual(z - step_fraction * change))
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         middle = (ends[0] + ends[1]) / 2
-        descends = descent(middle) >= 0
+        descends = slope(middle) >= 0
         return jnp.where(descends, middle, ends[0]), jnp.where(descends, ends[1], middle)
 
     # A full step is kept if it goes hardly past the minimum. If all components that it moves are
     # beyond their bounds, where `clip` has a tiny derivative, the step is far too long.
     ends = jnp.zeros((), z.dtype), jnp.ones((), z.dtype)
-    in_full = (descent(1.0) >= -(SLOPE_BEYOND_BOUNDS**0.5) * descent(0.0)) | ~goes_on
+    in_full = (slope(1.0) >= -(SLOPE_BEYOND_BOUNDS**0.5) * slope(0.0)) | ~goes_on
     bisected = lambda: lax.fori_loop(0, round(-math.log2(SLOPE_BEYOND_BOUNDS)), halve, ends)[1]  # noqa: E731
     step_fraction = lax.cond(any_lane(~in_full), bisected, lambda: ends[1])
     return jnp.where(in_full, ends[1], step_fraction)

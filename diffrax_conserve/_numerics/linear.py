@@ -18,25 +18,25 @@ Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
 
 
 def lu_factors(matrix: Float[Array, "m m"]) -> tuple[Array, Array]:
-    """`L` and `U` by LAPACK, and the permutation of the rows. `jax.scipy.linalg` keeps the pivots
-    instead, and each of its solves finds the permutation again, by a loop."""
+    """`L` and `U` in one matrix, and the permutation of the rows. `jax.scipy.linalg` keeps the
+    pivots instead, and each of its solves finds the permutation again, by a loop."""
     factors, _, permutation = lax.linalg.lu(matrix)
     return factors, permutation
 
 
 def lu_solution(factors: tuple[Array, Array], b: Array) -> Array:
     """The solution for a vector, or for the columns of a matrix."""
-    both, permutation = factors
+    lu, permutation = factors
     x = jnp.reshape(b, (len(b), -1)).at[permutation].get(mode="promise_in_bounds")
-    x = lax.linalg.triangular_solve(both, x, left_side=True, lower=True, unit_diagonal=True)
-    return lax.linalg.triangular_solve(both, x, left_side=True).reshape(b.shape)
+    x = lax.linalg.triangular_solve(lu, x, left_side=True, lower=True, unit_diagonal=True)
+    return lax.linalg.triangular_solve(lu, x, left_side=True).reshape(b.shape)
 
 
 def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
     """Two matrices of which `right left` is the inverse, by Gaussian elimination, written out in
     operations with rows, for a few of them. LAPACK takes longer for such matrices, and its
-    threads wait for each other on a busy machine. There is no search for pivots, which positive
-    definite matrices such as Gram matrices do not need.
+    threads wait for each other on a busy machine. There is no pivoting, which `U Uᵀ` does
+    not need, nor `U Vᵀ` for directions `V` near `U`.
 
     We do not multiply the two: where constraints depend on each other, the elements of the inverse
     are as large as one over what is added to the diagonal, and the roundoff of the product would
@@ -46,11 +46,11 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
     left = right = jnp.broadcast_to(jnp.eye(size, dtype=matrix.dtype), matrix.shape)
     for k in range(size - 1):
         pivot, later = matrix[..., k, k, None], np.arange(size) > k
-        below = jnp.where(later, matrix[..., :, k], 0) / pivot
-        beside = jnp.where(later, matrix[..., k, :], 0) / pivot
-        right = right - right[..., :, k, None] * beside[..., None, :]
-        left = left - below[..., :, None] * left[..., k, None, :]
-        matrix = matrix - below[..., :, None] * matrix[..., k, None, :]
+        lower = jnp.where(later, matrix[..., :, k], 0) / pivot
+        upper = jnp.where(later, matrix[..., k, :], 0) / pivot
+        right = right - right[..., :, k, None] * upper[..., None, :]
+        left = left - lower[..., :, None] * left[..., k, None, :]
+        matrix = matrix - lower[..., :, None] * matrix[..., k, None, :]
     return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
 
 
@@ -139,23 +139,23 @@ def forward_elimination(
     )
     matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
     size = [jnp.abs(gram[k, k]) for k in range(m)]
-    right, reduced_rows, order = list(b), list(rows), []
+    rhs, reduced_rows, order = list(b), list(rows), []
     for k in range(m):
         # At `k = 0` all quotients are one, so that nothing is exchanged.
         for i in range(k + 1, m) if k and not presorted else ():
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             order.append(larger)
-            for each in (*matrix[k:], matrix, size, right, reduced_rows):
+            for each in (*matrix[k:], matrix, size, rhs, reduced_rows):
                 _exchange(each, k, i, larger)
         pivot = jnp.where(jnp.abs(matrix[k][k]) > pivot_tolerance * size[k], matrix[k][k], jnp.inf)
         for i in range(k + 1, m):
-            below, beside = matrix[i][k] / pivot, matrix[k][i] / pivot
-            right[i] = right[i] - below * right[k]
-            reduced_rows[i] = reduced_rows[i] - beside * reduced_rows[k]
+            lower, upper = matrix[i][k] / pivot, matrix[k][i] / pivot
+            rhs[i] = rhs[i] - lower * rhs[k]
+            reduced_rows[i] = reduced_rows[i] - upper * reduced_rows[k]
             for j in range(k + 1, m):
-                matrix[i][j] = matrix[i][j] - below * matrix[k][j]
-        right[k] = right[k] / pivot
-    return jnp.stack(reduced_rows), jnp.stack(right), tuple(order)
+                matrix[i][j] = matrix[i][j] - lower * matrix[k][j]
+        rhs[k] = rhs[k] / pivot
+    return jnp.stack(reduced_rows), jnp.stack(rhs), tuple(order)
 
 
 def permuted(order: PivotOrder, each: Array) -> Array:

@@ -16,7 +16,7 @@ from .._constants import MAX_STEPS, ROUNDOFF
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
-from .._numerics.iterate import iterate, keep_done, left_after_test
+from .._numerics.iterate import iterate, left_after_test, where_active
 from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
 from .._numerics.rows import solve_dense
 from .._projection.closed_form import ClosedForm
@@ -214,7 +214,7 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
         change = solve_dense(gram, left)
         # An exponent changes by at most one in a step.
         longest = jnp.max(jnp.abs(jnp.sum(change[:, None] * weights, axis=0)), initial=1)
-        return keep_done(tests_left, multiplier + change / longest, multiplier), tests_left
+        return where_active(tests_left, multiplier + change / longest, multiplier), tests_left
 
     # Errors of ten per cent decrease as 1e-1, 5e-3, 1e-5, 1e-10, roundoff.
     newton = lambda guess: iterate(advance, guess, max_steps=MAX_STEPS)  # noqa: E731

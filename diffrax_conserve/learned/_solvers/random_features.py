@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._numerics.implicit import root
-from ..._numerics.iterate import Solved, iterate, keep_done, left_after_step
+from ..._numerics.iterate import Solved, iterate, left_after_step, where_active
 from ..._projection.options import check_state
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
@@ -219,7 +219,7 @@ def _newton(equations: StepEquations, start: Coefficients) -> Solved:
         size = jnp.max(jnp.abs(equations.states(change) - equations.y0))
         converged = size <= tolerance * jnp.max(jnp.abs(states))
         then = left_after_step(converged, jnp.isfinite(size), tests_left)
-        return keep_done(tests_left, coefficients - change, coefficients), then
+        return where_active(tests_left, coefficients - change, coefficients), then
 
     found = iterate(advance, start, max_steps=_MAX_STEPS)
     return found._replace(y=jnp.where(found.ok, found.y, 0))
