@@ -20,7 +20,8 @@ def pieces(y):
 def rows(y):
     q = y.reshape(6, 2)
     links = q - jnp.concatenate([jnp.zeros((1, 2)), q[:-1]])
-    return jnp.sum(jnp.pad(links, ((1, 2), (0, 1))) ** 2, axis=1), jnp.stack([q[1], -q[0]])
+    lengths = jnp.sum(jnp.pad(links, ((1, 2), (0, 1))) ** 2, axis=1)
+    return lengths, jnp.stack([q[1], -q[0]]), jnp.ravel(links, order="F")
 
 
 def by_indices(y):
@@ -137,6 +138,7 @@ OPERATIONS = (
     *(lambda x: jnp.where(np.arange(x.size) % 2, x, 0.0), lambda x: jnp.convolve(x, jnp.ones(3))),
     *(lambda x: jnp.split(x, [x.size // 2])[1], lambda x: jax.lax.pad(x, 0.0, ((0, 0, 1),))),
     *(lambda x: jax.lax.scan(lambda c, v: (c + v, c * v), 0.0, x)[1], lambda x: x / (1 + x**2)),
+    lambda x: jnp.ravel(jnp.stack([x, 2 * x]), order="F"),
 )
 
 

@@ -52,6 +52,7 @@ FORMS = {
     "dictionary": (lambda y: {"energy": energy(y), "momentum": momentum(y)}, ""),
     "jnp.array": (lambda y: jnp.array([energy(y), momentum(y)]), ""),
     "concatenate": (lambda y: jnp.concatenate([energy(y)[None], momentum(y)[None]]), ""),
+    "columns first": (lambda y: jnp.ravel(jnp.stack([both(y), 2 * y[:2]]), order="F")[::2], ""),
     "hstack": (lambda y: jnp.hstack([energy(y), momentum(y)]), ""),
     "append": (lambda y: jnp.append(energy(y), momentum(y)), ""),
     "at set": (lambda y: jnp.zeros(2, y.dtype).at[0].set(energy(y)).at[-1].set(momentum(y)), ""),

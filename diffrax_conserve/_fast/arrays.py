@@ -234,7 +234,7 @@ class _Program:
                 return [self.sliced(row[0], params["start_indices"], params["limit_indices"])]
             case "split":
                 return self._split(row[0], params["sizes"], params["axis"])
-            case "reshape" | "squeeze" | "expand_dims":
+            case "reshape" | "squeeze" | "expand_dims" if not params.get("dimensions"):
                 return [self.reshaped(row[0], out[0].shape)]
             case "broadcast_in_dim" if xs[0].number is not None:
                 return [self.full(xs[0].number, out[0].shape, out[0].dtype)]

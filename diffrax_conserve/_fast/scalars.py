@@ -340,7 +340,9 @@ MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
     "pad": _pad,
-    "reshape": lambda x, new_sizes: x.reshape(new_sizes),
+    "reshape": lambda x, new_sizes, dimensions=None: x.transpose(
+        range(x.ndim) if dimensions is None else dimensions
+    ).reshape(new_sizes),
     "rev": lambda x, dimensions: np.flip(x, dimensions),
     "slice": lambda x, start_indices, limit_indices, strides=None: x[
         tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))

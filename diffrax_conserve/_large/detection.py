@@ -1,14 +1,15 @@
 """The places of a Jacobian that can differ from zero, and keys for the functions that have it.
 
-The jaxpr of the function is walked with sets in the place of numbers: for each element of an array
-the elements of the argument on which it depends. They are the rows of a sparse matrix of booleans,
-so that a primitive is a few products and sums of such matrices. A primitive that moves elements
-takes rows of it, one on elements takes the union of the rows of its operands, and a sum that of
-those that it adds up. An operation that has no rule here may depend on all elements of its
-operands. Numbers are followed too, as far as they are known, because they are indices, or zeros by
-which something is multiplied.
+The jaxpr of the derivative along a tangent is walked with sets in the place of numbers: for each
+element of an array the elements of the tangent on which it depends. They are the rows of a sparse
+matrix of booleans, so that a primitive is a few products and sums of such matrices. A primitive
+that moves elements takes rows of it, one on elements takes the union of the rows of its operands,
+and a sum that of those that it adds up. An operation that has no rule here may depend on all
+elements of its operands. Numbers are followed too, as far as they are known, because they are
+indices, or zeros by which something is multiplied.
 """
 
+import contextlib
 import functools as ft
 from collections.abc import Iterable, Iterator
 from math import prod
@@ -20,6 +21,7 @@ import jax.extend.core as jex
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from jaxtyping import Array
 
 from .._fast.arrays import computed
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
@@ -58,12 +60,22 @@ def jacobian_places(closed: Any) -> tuple[np.ndarray, np.ndarray]:
     """The rows and columns of the elements of the Jacobian of the first output by the first
     argument that can differ from zero, whatever the other arguments are, and constants that JAX
     traces. Raises `NotSparse` if too many can."""
-    n = prod(closed.in_avals[0].shape)
-    walker = _Walker(n)
+    x, *rest = closed.in_avals
+    # With `jax.custom_vjp` there is reverse mode alone, and some callbacks have no derivative.
+    with contextlib.suppress(NotImplementedError, TypeError, ValueError):
+        closed = jax.make_jaxpr(ft.partial(_tangent, closed))(x, x, *rest)
+    walker = _Walker(n := prod(x.shape))
     given = [*map(walker.unknown, closed.in_avals)]
     given[0] = given[0]._replace(on=sp.eye_array(n, dtype=bool, format="csr"))
     found = sp.coo_array(walker.of_jaxpr(closed, given)[0].on)
     return found.coords[0].astype(np.int64), found.coords[1].astype(np.int64)
+
+
+def _tangent(closed: Any, tangent: Array, x: Array, *rest: Array) -> Array:
+    """The derivative along a tangent, which depends on that as the derivative rules say, those of
+    `jax.custom_jvp` too."""
+    fn = jex.jaxpr_as_fun(closed)
+    return jax.jvp(lambda x: fn(x, *rest)[0], (x,), (tangent,))[1]
 
 
 class NotSparse(Exception):
@@ -99,7 +111,7 @@ class _Walker:
         return _Array(tuple(like.shape), like.dtype, on, known)
 
     def constant(self, x: Any) -> _Array:
-        hidden = isinstance(x, jax.core.Tracer) or jnp.issubdtype(x.dtype, jax.dtypes.extended)
+        hidden = isinstance(x, jax.core.Tracer) or _is_extended(x)
         return self.unknown(x, None if hidden else np.asarray(x))
 
     def of_jaxpr(self, closed: Any, given: list[_Array]) -> list[_Array]:
@@ -124,7 +136,7 @@ class _Walker:
             return self._repeated(params["body_jaxpr"], consts, carry)
         if name == "scan":
             return self._scanned(params, xs)
-        if name in _STEPS or not any(jnp.issubdtype(x.dtype, jnp.inexact) for x in out):
+        if name in _STEPS or not any(map(_is_inexact, out)):
             return out
         found = _dependence(eqn, xs, out)
         if found is None:  # there is no rule: on all elements of all operands
@@ -163,6 +175,15 @@ class _Walker:
         return [*carry, *ends]
 
 
+def _is_inexact(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def _is_extended(x: Any) -> bool:
+    """Whether the elements are no numbers, but random keys."""
+    return jnp.issubdtype(x.dtype, jax.dtypes.extended)
+
+
 def _at(known: np.ndarray | None, i: int) -> np.ndarray | None:
     return None if known is None else known[i]
 
@@ -174,7 +195,7 @@ def _numbers(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[_Array]:
     if any(x is None for x in known):
         return out
     found = computed(eqn, known)  # pyright: ignore
-    if found is None and all(np.dtype(x.dtype).kind in "iub" for x in out):
+    if found is None and not any(_is_inexact(x) or _is_extended(x) for x in out):
         found = outputs(eqn, *known)
     if found is None:
         return out

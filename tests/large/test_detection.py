@@ -30,6 +30,14 @@ def slices(y):
     return jax.vmap(lambda i: jax.lax.dynamic_slice(y, (i,), (2,)))(np.arange(5))
 
 
+@jax.custom_jvp
+def rounded(y):
+    return jnp.round(y)
+
+
+rounded.defjvp(lambda primals, tangents: (rounded(*primals), tangents[0][::-1]))
+
+
 # Of these exactly the places are found that have a derivative.
 EXACT = {
     "shifted": lambda y: jnp.roll(y, 2) * y,
@@ -70,6 +78,9 @@ EXACT = {
         square(y), np.ones((3, 3)), mode="same"
     ),
     "a tangent": lambda y: jax.jvp(lambda y: jnp.roll(y, 1) * jnp.sin(y), (y,), (y,))[1],
+    "a derivative rule of its own": rounded,
+    "columns first": lambda y: jnp.ravel(square(y), order="F"),
+    "random numbers": lambda y: y * jax.random.normal(jax.random.key(0), (N,)),
     "a gradient": jax.grad(lambda y: jnp.sum(y[1:] ** 2 * y[:-1])),
 }
 # Of these at least those.
