@@ -52,6 +52,7 @@ def spread(y):
 
 def further(y):
     loop = jax.lax.fori_loop(0, 3, lambda _, x: jnp.sin(x), y)
+    loop = loop * jax.random.normal(jax.random.key(0), y.shape)
     return loop + jax.nn.relu(y), jax.lax.cond(y[0] > 0, jnp.cos, jnp.exp, y), y @ jnp.ones((N, 2))
 
 

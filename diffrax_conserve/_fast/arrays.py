@@ -219,7 +219,7 @@ class _Program:
             raise _NotFolded
         xs, out = [self.values[i] for i in row], [var.aval for var in eqn.outvars]
         whole = all(x.number is not None or x.known is not None for x in xs)
-        if whole and len(out) == 1 and out[0].dtype.kind in "iub" and name != "gather":
+        if whole and len(out) == 1 and is_whole(out[0].dtype) and name != "gather":
             found = computed(eqn, [_array(x) for x in xs])  # pyright: ignore
             if found is not None and not isinstance(found, list):
                 return [self.constant(np.asarray(found).astype(out[0].dtype))]
@@ -404,6 +404,12 @@ def _key(eqn: Any) -> Any:
     except TypeError:
         return "one", id(eqn)
     return eqn.primitive.name, params
+
+
+def is_whole(dtype: Any) -> bool:
+    """Whether the elements are integers or booleans, and neither numbers of another kind nor random
+    keys."""
+    return jnp.issubdtype(dtype, jnp.integer) or jnp.issubdtype(dtype, jnp.bool_)
 
 
 def computed(eqn: Any, arrays: list[np.ndarray]) -> np.ndarray | list[np.ndarray] | None:

@@ -23,7 +23,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array
 
-from .._fast.arrays import computed
+from .._fast.arrays import computed, is_whole
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._fast.scalars import BY_INDICES, ELEMENTWISE, MOVES, TAKES, moved_by, without_sharding
 
@@ -111,7 +111,7 @@ class _Walker:
         return _Array(tuple(like.shape), like.dtype, on, known)
 
     def constant(self, x: Any) -> _Array:
-        hidden = isinstance(x, jax.core.Tracer) or _is_extended(x)
+        hidden = isinstance(x, jax.core.Tracer) or jnp.issubdtype(x.dtype, jax.dtypes.extended)
         return self.unknown(x, None if hidden else np.asarray(x))
 
     def of_jaxpr(self, closed: Any, given: list[_Array]) -> list[_Array]:
@@ -179,11 +179,6 @@ def _is_inexact(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-def _is_extended(x: Any) -> bool:
-    """Whether the elements are no numbers, but random keys."""
-    return jnp.issubdtype(x.dtype, jax.dtypes.extended)
-
-
 def _at(known: np.ndarray | None, i: int) -> np.ndarray | None:
     return None if known is None else known[i]
 
@@ -195,7 +190,7 @@ def _numbers(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[_Array]:
     if any(x is None for x in known):
         return out
     found = computed(eqn, known)  # pyright: ignore
-    if found is None and not any(_is_inexact(x) or _is_extended(x) for x in out):
+    if found is None and all(is_whole(x.dtype) for x in out):
         found = outputs(eqn, *known)
     if found is None:
         return out
