@@ -27,8 +27,12 @@ from .._fast.arrays import computed, is_whole
 from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
 from .._fast.scalars import BY_INDICES, ELEMENTWISE, MOVES, TAKES, moved_by, without_sharding
 
-# A matrix of more elements than these is not sparse, and a loop of more steps is not followed.
+# A matrix or an array of more elements than these is not followed, and no loop
+# of more steps.
 _MOST_ELEMENTS, _MOST_STEPS = 2 * 10**7, 1000
+# The search ends after this many elements, about ten seconds, plus so many for each unknown. An
+# equation of the jaxpr takes as long as a number of elements.
+_MOST_WORK, _WORK_PER_UNKNOWN, _WORK_PER_EQUATION = 10**8, 1000, 5000
 _CALLS = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 _CALLS |= dict.fromkeys(["closed_call", "core_call", "checkpoint", "remat2"], "jaxpr")
 _ON_ELEMENTS = ELEMENTWISE | {"reduce_precision", "digamma", "bessel_i0e", "bessel_i1e"}
@@ -104,7 +108,7 @@ class _Walker:
     """The rules for the primitives, with an argument of `n` elements."""
 
     def __init__(self, n: int):
-        self.n = n
+        self.n, self.left = n, _MOST_WORK + _WORK_PER_UNKNOWN * n
 
     def unknown(self, like: Any, known: np.ndarray | None = None) -> _Array:
         on = sp.csr_array((prod(like.shape), self.n), dtype=bool)
@@ -115,7 +119,16 @@ class _Walker:
         return self.unknown(x, None if hidden else np.asarray(x))
 
     def of_jaxpr(self, closed: Any, given: list[_Array]) -> list[_Array]:
-        return walk(closed_jaxpr(closed), given, self.constant, self.equation)
+        return walk(closed_jaxpr(closed), given, self.constant, self.counted)
+
+    def counted(self, eqn: Any, xs: list[_Array]) -> list[_Array]:
+        if max((prod(var.aval.shape) for var in eqn.outvars), default=0) > _MOST_ELEMENTS:
+            raise NotSparse
+        found = self.equation(eqn, xs)
+        self.left -= _WORK_PER_EQUATION + sum(x.on.nnz for x in found)
+        if self.left < 0:
+            raise NotSparse
+        return found
 
     def equation(self, eqn: Any, xs: list[_Array]) -> list[_Array]:
         """What is known of the results of an equation."""
@@ -217,10 +230,17 @@ def _pairs(out: _Array, rows: Any, columns: Any, width: int) -> sp.csr_array:
 
 def _chosen(out: _Array, rows: Any, places: Any, x: _Array) -> sp.csr_array:
     """What the result depends on, if its elements in `rows` depend on those of `x` in `places`."""
-    on = sp.csr_array(_pairs(out, rows, places, x.size) @ x.on)
-    if on.nnz > _MOST_ELEMENTS:
+    pairs = _pairs(out, rows, places, x.size)
+    if np.sum(np.diff(x.on.indptr)[pairs.indices]) > _MOST_ELEMENTS:
         raise NotSparse
-    return on
+    return sp.csr_array(pairs @ x.on)
+
+
+def _taken(on: sp.csr_array, rows: np.ndarray) -> sp.csr_array:
+    """These rows, some of them repeatedly."""
+    if np.sum(np.diff(on.indptr)[rows]) > _MOST_ELEMENTS:
+        raise NotSparse
+    return on[rows]
 
 
 def _dependence(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[sp.csr_array] | None:
@@ -231,7 +251,7 @@ def _dependence(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[sp.csr_ar
         places = [x.places + start for x, start in zip(xs, starts, strict=False)]
         moved = MOVES[name](*places, **without_sharding(params))
         whole = sp.csr_array(sp.vstack([x.on for x in xs]))
-        return [whole[at.ravel()] for at in (moved if isinstance(moved, list) else [moved])]
+        return [_taken(whole, at.ravel()) for at in (moved if isinstance(moved, list) else [moved])]
     if name == "sort":
         every = np.ones([x.shape[params["dimension"]]] * 2, bool)
         return [_along(x, params["dimension"], every) for x in xs]
@@ -257,7 +277,8 @@ def _relevant(name: str, xs: list[_Array], shape: tuple[int, ...]) -> list[sp.cs
     """What an operation on elements depends on, for each operand. A product with the number zero
     depends on nothing, and a choice that is known on what is chosen."""
     rows = [
-        x.on if x.shape == shape else x.on[np.broadcast_to(x.places, shape).ravel()] for x in xs
+        x.on if x.shape == shape else _taken(x.on, np.broadcast_to(x.places, shape).ravel())
+        for x in xs
     ]
 
     def only(k: int, where: np.ndarray) -> None:

@@ -93,6 +93,8 @@ MORE = {
     )[1],
     "an inverse": lambda y: jnp.linalg.inv(y[:9].reshape(3, 3)),
     "a transform": lambda y: jnp.fft.fft(y).real,
+    "places by roundoff": lambda y: y[(jnp.arange(N) * 0.7 + 0.1).astype(int)],
+    "places out of range": lambda y: y.at[(jnp.arange(N) * 1e9).astype("int32")].get(mode="clip"),
     "unknown places": lambda y: y[jnp.argsort(y)],
 }
 
@@ -120,8 +122,21 @@ def test_numbers_that_are_arguments_may_have_any_values():
     assert len(jacobian_places(pick)[0]) == 3 * N
 
 
-def test_what_would_take_much_memory_is_refused_at_once():
-    closed = jax.make_jaxpr(lambda y: jnp.outer(y, y) @ y)(jax.ShapeDtypeStruct((10_000,), float))
+def mean_width(y):
+    """A kernel whose width is the mean distance."""
+    distances = y[:, None] - y[None, :]
+    return jnp.sum(jnp.exp(-(distances**2) / jnp.mean(distances**2)), axis=1)
+
+
+def long_loops(y):
+    """Sparse, but with a million equations."""
+    loop = lambda fn: lambda _, y: jax.lax.fori_loop(0, 1000, fn, y)  # noqa: E731
+    return loop(loop(lambda _, y: y + 0.1 * jnp.sin(y)))(0, y)
+
+
+@pytest.mark.parametrize("fn", [lambda y: jnp.outer(y, y) @ y, mean_width, long_loops])
+def test_what_would_take_much_memory_or_time_is_refused(fn):
+    closed = jax.make_jaxpr(fn)(jax.ShapeDtypeStruct((10_000,), float))
     with pytest.raises(NotSparse):
         jacobian_places(closed)
 
