@@ -53,6 +53,18 @@ def closed_jaxpr(jaxpr: Any) -> jex.ClosedJaxpr:
     return jaxpr if isinstance(jaxpr, jex.ClosedJaxpr) else jex.ClosedJaxpr(jaxpr, ())
 
 
+def carried(scan: Any) -> tuple[int, int]:
+    """Where the operands of a `scan` that are carried begin and end.
+
+    Before them are constants, after them arrays over which the loop runs. The parameters that count
+    them have other names in other versions of JAX. But only arrays of the last kind have another
+    shape inside the loop than outside, and so we can count.
+    """
+    inside, alike = scan.params["jaxpr"], lambda var, x: var.aval.shape == x.shape
+    last = sum(map(alike, scan.invars, inside.in_avals))
+    return last - sum(map(alike, scan.outvars, inside.out_avals)), last
+
+
 def jaxprs_inside(eqn: Any) -> list[jex.ClosedJaxpr]:
     """The programs that an equation runs, such as the body of a loop."""
     is_jaxpr = lambda x: isinstance(x, jex.ClosedJaxpr | jex.Jaxpr)  # noqa: E731

@@ -24,7 +24,7 @@ import scipy.sparse as sp
 from jaxtyping import Array
 
 from .._fast.arrays import computed, is_whole
-from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
+from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, outputs, walk
 from .._fast.scalars import BY_INDICES, ELEMENTWISE, MOVES, TAKES, moved_by, without_sharding
 
 # A matrix or an array of more elements than these is not followed, and no loop
@@ -148,7 +148,7 @@ class _Walker:
             consts, carry = xs[first : first + count], xs[first + count :]
             return self._repeated(params["body_jaxpr"], consts, carry)
         if name == "scan":
-            return self._scanned(params, xs)
+            return self._scanned(eqn, xs)
         if name in _STEPS or not any(map(_is_inexact, out)):
             return out
         found = _dependence(eqn, xs, out)
@@ -165,9 +165,9 @@ class _Walker:
             carry = [*map(_either, carry, self.of_jaxpr(body, [*consts, *carry]))]
         return carry
 
-    def _scanned(self, params: Any, xs: list[_Array]) -> list[_Array]:
-        first, length, found = params["num_consts"], params["length"], []
-        last = first + params["num_carry"]
+    def _scanned(self, eqn: Any, xs: list[_Array]) -> list[_Array]:
+        params, found, (first, last) = eqn.params, [], carried(eqn)
+        length = params["length"]
         if not 0 < length <= _MOST_STEPS:
             raise NotSparse
         consts, carry, order = xs[:first], xs[first:last], range(length)

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 
 from .._constants import MIN_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
-from .._fast.jaxprs import closed_jaxpr, jaxprs_inside, outputs, walk
+from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import pattern_of
 from .._manifold import calling_fn, named_entries
 from .._tree import eps_of, ravel, tree_stop_gradient
@@ -193,12 +193,8 @@ def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> li
 
 def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
     params, inside = eqn.params, eqn.params["jaxpr"]
-    # The operands are constants, what is carried, and arrays over which the loop runs. Parameters
-    # that count them have other names in other versions of JAX. But only elements of the last kind
-    # have another shape inside the loop than outside, and so we can count.
-    alike = lambda var, x: var.aval.shape == x.shape  # noqa: E731
-    num_carry = sum(map(alike, eqn.outvars, inside.out_avals))
-    first = (last := sum(map(alike, eqn.invars, inside.in_avals))) - num_carry
+    first, last = carried(eqn)
+    num_carry = last - first
 
     # Without a checkpoint, reverse mode would keep the values of each step of a long scan.
     @jax.checkpoint
