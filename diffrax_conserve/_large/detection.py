@@ -4,12 +4,12 @@ The jaxpr of the derivative along a tangent is walked with sets in the place of 
 element of an array the elements of the tangent on which it depends. They are the rows of a sparse
 matrix of booleans, so that a primitive is a few products and sums of such matrices. A primitive
 that moves elements takes rows of it, one on elements takes the union of the rows of its operands,
-and a sum that of those that it adds up. An operation that has no rule here may depend on all
+and a sum that of those that it adds up. The derivative is linear in the tangent, so that no other
+primitives need a rule. An operation that has no rule here may depend on all
 elements of its operands. Numbers are followed too, as far as they are known, because they are
 indices, or zeros by which something is multiplied.
 """
 
-import contextlib
 import functools as ft
 from collections.abc import Iterable, Iterator
 from math import prod
@@ -27,21 +27,13 @@ from .._fast.arrays import computed, is_whole
 from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, outputs, walk
 from .._fast.scalars import BY_INDICES, ELEMENTWISE, MOVES, TAKES, moved_by, without_sharding
 
-# A matrix or an array of more elements than these is not followed, and no loop
-# of more steps.
+# A matrix or an array of more elements than these is not followed, and no loop of more steps.
 _MOST_ELEMENTS, _MOST_STEPS = 2 * 10**7, 1000
 # The search ends after this many elements, about ten seconds, plus so many for each unknown. An
 # equation of the jaxpr takes as long as a number of elements.
 _MOST_WORK, _WORK_PER_UNKNOWN, _WORK_PER_EQUATION = 10**8, 1000, 5000
-_CALLS = {"custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
-_CALLS |= dict.fromkeys(["closed_call", "core_call", "checkpoint", "remat2"], "jaxpr")
-_ON_ELEMENTS = ELEMENTWISE | {"reduce_precision", "digamma", "bessel_i0e", "bessel_i1e"}
-# Their derivative is zero, where it exists.
-_STEPS = frozenset(["ceil", "floor", "round", "sign", "stop_gradient"])
-_CUMULATED = frozenset(["cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp"])
-_REDUCTIONS = frozenset(["reduce_sum", "reduce_prod", "reduce_max", "reduce_min"])
-_SCATTERS = ["scatter-sub", "scatter-mul", "scatter-min", "scatter-max"]
-_BY_INDICES = BY_INDICES | dict.fromkeys(_SCATTERS, (1, 2))
+_CALLS = frozenset(["closed_call", "core_call", "checkpoint", "remat2"])
+_BY_INDICES = BY_INDICES | dict.fromkeys(["scatter-sub", "scatter-mul"], (1, 2))
 
 
 def constants_of(closed: Any) -> Iterator[Any]:
@@ -64,22 +56,17 @@ def jacobian_places(closed: Any) -> tuple[np.ndarray, np.ndarray]:
     """The rows and columns of the elements of the Jacobian of the first output by the first
     argument that can differ from zero, whatever the other arguments are, and constants that JAX
     traces. Raises `NotSparse` if too many can."""
-    x, *rest = closed.in_avals
-    # With `jax.custom_vjp` there is reverse mode alone, and some callbacks have no derivative.
-    with contextlib.suppress(NotImplementedError, TypeError, ValueError):
-        closed = jax.make_jaxpr(ft.partial(_tangent, closed))(x, x, *rest)
-    walker = _Walker(n := prod(x.shape))
-    given = [*map(walker.unknown, closed.in_avals)]
-    given[0] = given[0]._replace(on=sp.eye_array(n, dtype=bool, format="csr"))
-    found = sp.coo_array(walker.of_jaxpr(closed, given)[0].on)
+    fn, given = jex.jaxpr_as_fun(closed), closed.in_avals
+
+    def along(tangent: Array, x: Array, *rest: Array) -> Array:
+        return jax.jvp(lambda x: fn(x, *rest)[0], (x,), (tangent,))[1]
+
+    walker = _Walker(n := prod(given[0].shape))
+    tangent, *others = map(walker.unknown, (given[0], *given))
+    tangent = tangent._replace(on=sp.eye_array(n, dtype=bool, format="csr"))
+    linear = jax.make_jaxpr(along)(given[0], *given)
+    found = sp.coo_array(walker.of_jaxpr(linear, [tangent, *others])[0].on)
     return found.coords[0].astype(np.int64), found.coords[1].astype(np.int64)
-
-
-def _tangent(closed: Any, tangent: Array, x: Array, *rest: Array) -> Array:
-    """The derivative along a tangent, which depends on that as the derivative rules say, those of
-    `jax.custom_jvp` too."""
-    fn = jex.jaxpr_as_fun(closed)
-    return jax.jvp(lambda x: fn(x, *rest)[0], (x,), (tangent,))[1]
 
 
 class NotSparse(Exception):
@@ -137,7 +124,7 @@ class _Walker:
         if not any(x.on.nnz for x in xs):
             return _numbers(eqn, xs, out)
         if name in _CALLS:
-            return self.of_jaxpr(params[_CALLS[name]], xs)
+            return self.of_jaxpr(params["jaxpr"], xs)
         if name == "cond":
             which, *given = xs
             ends = [self.of_jaxpr(branch, given) for branch in params["branches"]]
@@ -149,7 +136,7 @@ class _Walker:
             return self._repeated(params["body_jaxpr"], consts, carry)
         if name == "scan":
             return self._scanned(eqn, xs)
-        if name in _STEPS or not any(map(_is_inexact, out)):
+        if not any(jnp.issubdtype(x.dtype, jnp.inexact) for x in out):
             return out
         found = _dependence(eqn, xs, out)
         if found is None:  # there is no rule: on all elements of all operands
@@ -186,10 +173,6 @@ class _Walker:
             for row, on in zip(parts, wholes, strict=True)
         ]
         return [*carry, *ends]
-
-
-def _is_inexact(x: Any) -> bool:
-    return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
 def _at(known: np.ndarray | None, i: int) -> np.ndarray | None:
@@ -252,15 +235,11 @@ def _dependence(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[sp.csr_ar
         moved = MOVES[name](*places, **without_sharding(params))
         whole = sp.csr_array(sp.vstack([x.on for x in xs]))
         return [_taken(whole, at.ravel()) for at in (moved if isinstance(moved, list) else [moved])]
-    if name == "sort":
-        every = np.ones([x.shape[params["dimension"]]] * 2, bool)
-        return [_along(x, params["dimension"], every) for x in xs]
-    if name in _CUMULATED:
-        before = np.tri(x.shape[params["axis"]], dtype=bool)
-        return [_along(x, params["axis"], before.T if params["reverse"] else before)]
-    if name in _ON_ELEMENTS:
+    if name == "cumsum":
+        return [_cumulated(x, params["axis"], params["reverse"])]
+    if name in ELEMENTWISE:
         return [_union(_relevant(name, xs, one.shape))]
-    if name in _REDUCTIONS:
+    if name == "reduce_sum":
         axes = params["axes"]
         places = np.moveaxis(x.places, axes, range(-len(axes), 0)).reshape(one.size, -1)
         return [_chosen(one, np.arange(one.size)[:, None], places, x)]
@@ -297,11 +276,11 @@ def _relevant(name: str, xs: list[_Array], shape: tuple[int, ...]) -> list[sp.cs
     return rows
 
 
-def _along(x: _Array, axis: int, on: np.ndarray) -> sp.csr_array:
-    """Of an operation along an axis, where `on[i, j]` tells whether element `i` of the result
-    depends on `j`."""
+def _cumulated(x: _Array, axis: int, reverse: bool) -> sp.csr_array:
+    """Of sums along an axis, each with all elements before it or, in reverse, after it."""
     lines = np.moveaxis(x.places, axis, -1).reshape(-1, x.shape[axis])
-    of, by = np.nonzero(on)
+    before = np.tri(x.shape[axis], dtype=bool)
+    of, by = np.nonzero(before.T if reverse else before)
     if len(lines) * of.size > _MOST_ELEMENTS:
         raise NotSparse
     return _chosen(x, lines[:, of], lines[:, by], x)

@@ -117,6 +117,21 @@ def test_no_place_is_missing_and_few_are_in_vain(name, jacobians):
         np.testing.assert_array_equal(places, found)
 
 
+@jax.custom_vjp
+def turned(y):
+    return jnp.floor(y)
+
+
+turned.defvjp(lambda y: (turned(y), y), lambda y, cotangent: (cotangent[::-1] * y,))
+
+
+def test_a_derivative_rule_in_reverse_mode_alone_counts_as_dense():
+    fn, y = lambda y: y[1:] * turned(y)[:-1], jnp.linspace(1.5, 3.0, N)
+    places = np.zeros((N - 1, N), bool)
+    places[jacobian_places(jax.make_jaxpr(fn)(y))] = True
+    assert np.all(places | (jax.jacrev(fn)(y) == 0))
+
+
 def test_numbers_that_are_arguments_may_have_any_values():
     pick = jax.make_jaxpr(lambda y, order: y[order])(jnp.ones(N), ORDER[:3])
     assert len(jacobian_places(pick)[0]) == 3 * N
