@@ -106,9 +106,7 @@ def main(argv=None):
             if options.only in f"{name}, batch {batch}":
                 steps = 3 if options.smoke else max(30, 20_000 // (1 + batch // 4))
                 rows.append(measure(name, batch, steps))
-                items = rows[-1].items()
-                cells = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in items]
-                print(", ".join(cells), flush=True)
+                measuring.print_row(rows[-1])
     measuring.write(options, measuring.machine(), rows=rows)
     return rows
 

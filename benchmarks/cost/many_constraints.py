@@ -320,9 +320,7 @@ def main(argv=None):
     for case in cases:
         if options.only in case[0]:
             rows.append(measure(*case))
-            items = rows[-1].items()
-            cells = [f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in items]
-            print(", ".join(cells), flush=True)
+            measuring.print_row(rows[-1])
     measuring.write(options, measuring.machine(), rows=rows)
     return rows
 

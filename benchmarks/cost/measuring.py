@@ -101,6 +101,11 @@ def compiled(fn: Callable[..., Any], *args: Any) -> tuple[Any, float]:
     return executable, clock() - begin
 
 
+def print_row(row: Mapping[str, Any]) -> None:
+    cells = (f"{k} {v:.3g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
+    print(", ".join(cells), flush=True)
+
+
 # ---- Programs in C ----
 
 C_FLAGS = ("-O3", "-march=native", "-mprefer-vector-width=512", "-ffast-math", "-fopenmp-simd")

@@ -54,6 +54,11 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
     return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
 
 
+def diagonal_shift(matrix: Array) -> float:
+    """What is added to the diagonal of a larger Gram matrix, whose elements there are one."""
+    return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
+
+
 def gram_inverse(rows: Float[Array, "m n lanes"]) -> Solve:
     """`(U Uᵀ)⁻¹ b` as a function of `b`, for the rows `U` of each lane, by Gaussian elimination as
     in `inverse_factors`.
@@ -70,8 +75,10 @@ def gram_inverse(rows: Float[Array, "m n lanes"]) -> Solve:
         matrix = ft.reduce(op.add, (x[:, None] * x for x in jnp.unstack(rows, axis=1)))
     diagonal = jnp.stack([matrix[k, k] for k in range(m)])
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    added = eps_of(matrix) ** REGULARISATION_POWER * m**0.5
-    matrix = matrix / (size[:, None] * size) + added * np.eye(m, dtype=rows.dtype)[..., None]
+    matrix = (
+        matrix / (size[:, None] * size)
+        + diagonal_shift(matrix) * np.eye(m, dtype=rows.dtype)[..., None]
+    )
     index = np.arange(m)[:, None]
 
     def eliminate(k: Array, matrix: Array) -> Array:

@@ -32,10 +32,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_BLOCK, MAX_UNROLLED, REGULARISATION_POWER
+from .._constants import MAX_BLOCK, MAX_UNROLLED
 from .._tree import eps_of
 from .linear import (
     Solve,
+    diagonal_shift,
     forward_elimination,
     inverse_factors,
     iterative_refinement,
@@ -254,12 +255,8 @@ class RegularisedGram(_DenseGram):
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         matrix, equilibration = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
-        eps, one = eps_of(matrix), jnp.eye(len(matrix), dtype=dtype)
-        added = (
-            eps**REGULARISATION_POWER * len(matrix) ** 0.5
-            if pivot_tolerance is None
-            else pivot_tolerance
-        )
+        added = diagonal_shift(matrix) if pivot_tolerance is None else pivot_tolerance
+        one = jnp.eye(len(matrix), dtype=dtype)
         matrix = matrix.astype(dtype) + added * one
         if len(matrix) > MAX_BLOCK:
             # To invert larger factors takes longer than the few substitutions of a step.
