@@ -117,33 +117,6 @@ def written(
     return evaluated
 
 
-def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
-    """`run(given, is_batched)` as a function of `given`.
-
-    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
-    steps of a solve several times. `run` returns arrays.
-    """
-
-    def call(given: Any) -> Any:
-        arrays, static = eqx.partition(given, eqx.is_array)
-
-        def variant(is_batched: bool) -> Callable[[Any], Any]:
-            return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
-
-        unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
-
-        @unbatched.def_vmap
-        def batched(size: int, axes: Any, arrays: Any) -> Any:
-            del size
-            (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
-            out = jax.vmap(lane, (axes,))(arrays)
-            return out, jtu.tree_map(lambda x: True, out)
-
-        return unbatched(arrays)
-
-    return call
-
-
 def with_lanes_last(run: Callable[[Any, Array, bool], Any]) -> Callable[[Any, Array], Any]:
     """`run(each, y, is_batched)` as a function of `given` and `y`, where `each(fn)(*xs)` is
     `fn(given, *xs)`.
@@ -208,31 +181,11 @@ def _mapped(fn: Callable[..., Any], axes: Any, leaves: Any, xs: tuple[Any, ...])
     )
 
 
-def loop_in_scalars(
-    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, tests_left: Array
-) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
-    """The functions of a loop, `first = start(y)` and `y, tests_left = advance(first, y,
-    tests_left)`, in scalars, with `y` as a tuple of them. They are returned as they are if one is
-    too large."""
-    first = jax.eval_shape(start, y)
-    starts, advances = scalarised(start, y), scalarised(advance, first, y, tests_left)
-    if starts is None or advances is None:
-        return start, advance, y
-    return starts, advances, components(y)
-
-
 def components(x: Array) -> Any:
     """The elements of an array; a scalar remains what it is."""
     if jnp.ndim(x) == 0:
         return x
     return tuple(jnp.unstack(jnp.reshape(x, -1))) if jnp.size(x) else ()
-
-
-def joined(like: Any, scalars: Any) -> Array:
-    """The array shaped like `like` with these elements."""
-    if not isinstance(scalars, tuple):
-        return scalars
-    return jnp.stack(scalars).reshape(like.shape) if scalars else jnp.zeros(like.shape, like.dtype)
 
 
 # An array of integers: where in the list of scalars the elements of an array are.

@@ -41,7 +41,7 @@ from .._constants import (
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
 )
-from .._fast.scalars import joined, loop_in_scalars, with_batch_flag, with_lanes_last
+from .._fast.scalars import components, scalarised, with_lanes_last
 from .linear import (
     forward_elimination,
     gram_inverse,
@@ -152,6 +152,29 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[
     return any_lane(jnp.any(flags)), False
 
 
+def with_batch_flag(run: Callable[[Any, bool], Any], given: Any) -> Any:
+    """`run(given, is_batched)`, which are arrays.
+
+    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
+    steps of a solve several times.
+    """
+    arrays, static = eqx.partition(given, eqx.is_array)
+
+    def variant(is_batched: bool) -> Callable[[Any], Any]:
+        return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
+
+    unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
+
+    @unbatched.def_vmap
+    def batched(size: int, axes: Any, arrays: Any) -> Any:
+        del size
+        (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
+        out = jax.vmap(lane, (axes,))(arrays)
+        return out, jtu.tree_map(lambda x: True, out)
+
+    return unbatched(arrays)
+
+
 def where_active(tests_left: Array, moved: Any, y: Any) -> Any:
     """The moved unknowns where the iteration goes on, and the old ones where it is done."""
     return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
@@ -176,9 +199,8 @@ def simplified_newton(
     if problem.magnitude.size > MAX_UNROLLED:
         run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
         return with_lanes_last(run)(problem, candidate)
-    return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
-        (problem, candidate, directions)
-    )
+    run = ft.partial(_with_fresh_jacobians, max_steps=max_steps)
+    return with_batch_flag(run, (problem, candidate, directions))
 
 
 def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> Solved:
@@ -228,15 +250,18 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         return where_active(tests_left, newton_point, y), tests_left
 
     if is_batched:
-        tests_left = initial_tests(max_steps)
-        # Unchanged, if the loop would be too large in scalars.
-        invariants_of, advance, y = loop_in_scalars(loop_invariants, advance, candidate, tests_left)
+        like = jax.eval_shape(loop_invariants, candidate), candidate, initial_tests(max_steps)
+        start, step = scalarised(loop_invariants, candidate), scalarised(advance, *like)
+        if start and step and candidate.size:
+            y = components(candidate)
+            solved = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
+            return solved._replace(y=jnp.stack(solved.y))
+        y = candidate
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        invariants_of, y = loop_invariants, lax.optimization_barrier(candidate)
-    solved = iterate(ft.partial(advance, invariants_of(y)), y, max_steps=max_steps)
-    return solved._replace(y=joined(candidate, solved.y))
+        y = lax.optimization_barrier(candidate)
+    return iterate(ft.partial(advance, loop_invariants(y)), y, max_steps=max_steps)
 
 
 def _with_frozen_matrix(
