@@ -96,8 +96,7 @@ def irregular_weights(n: int, dtype: Any) -> Array:
 
 def ravel(y: Any) -> Any:
     """The components of `y` as one real vector, complex ones as real and imaginary parts."""
-    leaves = [jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))]
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))])
 
 
 def unravel(vector: Any, like: Any) -> Any:

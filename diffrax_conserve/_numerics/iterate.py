@@ -31,6 +31,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import (
@@ -105,9 +106,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
 
 
 def initial_tests(max_steps: int) -> Int[Array, ""]:
-    """The number of tests at the start of an iteration, in a byte if it fits."""
-    fits = max_steps + 1 < jnp.iinfo(jnp.int8).max
-    return jnp.asarray(max_steps + 1, jnp.int8 if fits else jnp.int32)
+    """The number of tests at the start of an iteration, in the shortest signed integer."""
+    return jnp.asarray(max_steps + 1, np.min_scalar_type(-max_steps - 2))
 
 
 def left_after_test(level: Array, tests_left: Array, *, polish: bool = True) -> Array:

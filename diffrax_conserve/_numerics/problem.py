@@ -312,27 +312,19 @@ def problem_of(
     )
 
 
-class _Concrete:
-    """An array in a box, which JAX takes for a leaf that is no array. So no transformation replaces
-    it by a tracer, and its numbers remain known."""
-
-    def __init__(self, value: Any):
-        self.value = value
-
-
 class _Converted(eqx.Module):
     """A function after closure conversion, in which the integers over which it closes keep their
     values. They are usually indices, such as of `y[indices]`, and `scalars` can follow a function
-    that moves elements only if it knows the indices."""
+    that moves elements only if it knows the indices. For JAX the function `constants` is a leaf
+    that is no array, so that no transformation replaces what it returns by tracers."""
 
-    fn: Any
+    arrays: Any
+    constants: Callable[[], Any]
 
     def __init__(self, fn: Any):
-        def known(x: Any) -> Any:
-            constant = hasattr(x, "dtype") and not isinstance(x, jax.core.Tracer)
-            return _Concrete(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
-
-        self.fn = jtu.tree_map(known, fn)
+        is_variable = lambda x: isinstance(x, jax.core.Tracer) or eqx.is_inexact_array(x)  # noqa: E731
+        self.arrays, constants = eqx.partition(fn, is_variable)
+        self.constants = lambda: constants
 
     def __call__(self, y: Array) -> Array:
-        return jtu.tree_map(lambda x: x.value if isinstance(x, _Concrete) else x, self.fn)(y)
+        return eqx.combine(self.arrays, self.constants())(y)

@@ -31,7 +31,6 @@ from .failure import (
     failure_cause,
     is_shortest_step,
     masked_step,
-    needs_consistent_start,
     starts_off_manifold,
 )
 from .state import State, initial_values, updated_units
@@ -376,7 +375,7 @@ class ManifoldProjection(ForwardingSolver):
         after a jump of the vector field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         entries = [entry for _, entry in named_entries(self.manifold)]
-        if not any(map(needs_consistent_start, entries)):
+        if all(entry.value is not None for entry in entries):
             return invalid_values
         # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
         # comparison is false, and its projection fails.
