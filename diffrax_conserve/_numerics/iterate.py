@@ -12,8 +12,7 @@ is called a step of the solver.
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
   last state, so that the iteration is Newton's method; for more it is evaluated at the candidate.
-- `projected_newton` keeps a state within bounds. It is a semismooth Newton method along given
-  directions, with a line search.
+- `semismooth_newton` keeps a state within bounds, along given directions, with a line search.
 - `damped_newton` is for starts far away. Without given directions each step is the shortest, in the
   metric, that solves the equations linearised at the last state (P. Deuflhard, *Newton Methods for
   Nonlinear Problems*, Springer 2004, Section 4.4). A step that increases the largest residual, or
@@ -399,7 +398,7 @@ def damped_newton(
 # ---- Within bounds ----
 
 
-def projected_newton(
+def semismooth_newton(
     problem: Problem, start: Float[Array, " n"], directions: AbstractRows, *, max_steps: int
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.

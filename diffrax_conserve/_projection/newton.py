@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
-from .._numerics.implicit import MultiplierSystem, implicit_solution, nan_tangent_unless, root
+from .._numerics.implicit import nan_tangent_unless, root
 from .._numerics.iterate import Solved, damped_newton
 from .._numerics.metric import Identity
 from .._numerics.problem import Problem
@@ -73,13 +73,15 @@ class Newton(AbstractNewton):
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
         bounds = self.bounds(problem.like)
-        given = _Given(problem.dense(), candidate, bounds)
+        given, start = _Given(problem.dense(), candidate, bounds), (bounds, problem, candidate)
+        # Nobody uses the derivative of the first phase: that of the nearest point is by the second
+        # one, and elsewhere it is NaN.
+        first_phase = ft.partial(project_within, max_steps=self.max_steps, iteration=damped_newton)
         if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
-            first = _some_point(problem, given, self.max_steps)
+            first = first_phase(*start)
             y, more = nan_tangent_unless(given.clip(first.y), False), 0
         else:
-            problem, still = tree_stop_gradient((problem, given))
-            first = _some_point(problem, still, self.max_steps)
+            first = first_phase(*tree_stop_gradient(start))
             y, more = _nearest(given, first.y, self.max_steps)
         return y, problem.report(candidate, y, first.num_iterations + more)
 
@@ -96,16 +98,6 @@ class _Given(eqx.Module):
 
     def clip(self, z: Float[Array, " n"]) -> Float[Array, " n"]:
         return z if self.bounds is None else self.bounds.clip(z)
-
-
-def _some_point(problem: Problem, given: _Given, max_steps: int) -> Solved:
-    """First phase: some point of the manifold, within bounds before the clip. Nobody uses its
-    derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
-    if given.bounds is not None:
-        return project_within(given.bounds, problem, given.candidate, max_steps=max_steps)
-    return implicit_solution(
-        MultiplierSystem(problem, given.candidate, iteration=damped_newton, max_steps=max_steps)
-    )
 
 
 class _Conditions(eqx.Module):
