@@ -89,8 +89,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
     the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which no test is left, as they are. If their last axis are the lanes, `lanes` is
-    its shape, and there is a number of tests for each.
+    are done, for which no test is left, as they are. If the lanes are the last axis of the
+    unknowns, `lanes` is its shape, and each lane has a number of tests of its own.
     """
 
     def body(now: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
@@ -212,7 +212,7 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     def loop_invariants(y: Any) -> Any:
         """The order in which all steps eliminate the constraints, and in this order the given
         directions, or the gradients at the candidate."""
-        rows = problem.gradients(y).scaled()[1]
+        rows = problem.gradients(y).equilibrated()[1]
         fixed = rows if directions is None else directions
         gram = rows.gram(fixed).matrix
         order = forward_elimination(gram, gram[0], gram)[2]
@@ -224,7 +224,7 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = linearised if is_batched else lax.optimization_barrier(linearised)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         rows, to_correct = permuted(order, rows.matrix), permuted(order, to_correct / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
         # We count by the number before `left_after_test`, which may set it to two for a step that
@@ -276,7 +276,7 @@ def _with_frozen_matrix(
     def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
         g, jacobian = problem.linearise(y)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         return level, to_correct, row_scales, rows.matrix  # pyright: ignore
 
     def factored(row_scales: Array, rows: Array) -> Any:
@@ -320,7 +320,7 @@ def _with_frozen_jacobian(
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
     gradients = problem.factor.scale_columns(jacobian)
-    row_scales, rows = gradients.scaled()
+    row_scales, rows = gradients.equilibrated()
     solve = rows.gram(rows).factorise()
     _, vjp = jax.vjp(problem.residual, candidate)
 
@@ -380,7 +380,7 @@ def damped_newton(
         scale = jnp.where(is_first, scale_at_y, now.scale)
         residuals = jnp.abs(relative_to_scale(g, scale))
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         current = rows if directions is None else directions
         change = rows.gram(current).row_space_correction(current, to_correct / row_scales)
         newton_point = y - problem.factor.to_state(change)
@@ -413,7 +413,7 @@ def semismooth_newton(
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         level, _ = problem.level(g, problem.scale(jacobian, z))
         tests_left = left_after_test(level, tests_left, polish=False)
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = rows.gram(directions).solve(g / row_scales)

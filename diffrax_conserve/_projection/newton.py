@@ -102,13 +102,13 @@ class _Given(eqx.Module):
 
 class _Conditions(eqx.Module):
     """The Lagrange conditions as functions of one vector: the change `u` from a `base`, with
-    `y = base + S u`, and the multipliers times the lengths of the gradients there. So no unknown
-    has a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
+    `y = base + S u`, and the multipliers times the norms of the gradients there. So no unknown has
+    a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
     vector without bounds, which `clip` maps to the state."""
 
     given: _Given
     base: Float[Array, " n"]
-    lengths: Float[Array, " m"]
+    row_norms: Float[Array, " m"]
 
     def state(self, unknowns: Float[Array, " N"]) -> Float[Array, " n"]:
         # The base is only a place to start from. It moves with the candidate, and with nothing
@@ -122,7 +122,7 @@ class _Conditions(eqx.Module):
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
-        gradient = problem.factor.scale_gradient(vjp(multiplier / self.lengths)[0])
+        gradient = problem.factor.scale_gradient(vjp(multiplier / self.row_norms)[0])
         return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
 
 
@@ -131,8 +131,8 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     problem, y = given.problem, given.clip(base)
     jacobian = problem.linearise(y)[1]
-    lengths, rows = problem.factor.scale_columns(jacobian).unit()
-    conditions = _Conditions(given, base, lengths)
+    row_norms, rows = problem.factor.scale_columns(jacobian).normalised()
+    conditions = _Conditions(given, base, row_norms)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
     scale = problem.scale(jacobian, y)
