@@ -197,7 +197,7 @@ def simplified_newton(
         return _with_frozen_jacobian(problem, candidate, max_steps)
     if problem.magnitude.size > MAX_UNROLLED:
         run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
-        return with_lanes_last(run)(problem, candidate)
+        return with_lanes_last(run, problem, candidate)
     run = ft.partial(_with_fresh_jacobians, max_steps=max_steps)
     return with_batch_flag(run, (problem, candidate, directions))
 
