@@ -152,7 +152,7 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[
 
 
 def with_batch_flag(run: Callable[[Any, bool], Any], given: Any) -> Any:
-    """`run(given, is_batched)`, which are arrays.
+    """`run(given, is_batched)`, a PyTree of arrays. The flag tells whether a `vmap` is around it.
 
     Both variants are jitted, so that JAX traces each once, although it batches the loop over the
     steps of a solve several times.

@@ -2,7 +2,7 @@
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` is its function.
 
-A residual in floating-point arithmetic is never exactly zero, so this file also says when it counts
+A residual in floating-point arithmetic is rarely exactly zero, so this file also says when it counts
 as zero. The roundoff of a residual is proportional to the size of the terms that cancel in it, its
 *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the change of the residual by relative
 errors of `ε` in `I₀` and in each component of the state, divided by `ε`. Terms that cancel inside a

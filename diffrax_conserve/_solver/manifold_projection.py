@@ -374,8 +374,7 @@ class ManifoldProjection(ForwardingSolver):
         tested where the state is not the end of the last step, as at the start of a solve, and
         after a jump of the vector field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
-        entries = [entry for _, entry in named_entries(self.manifold)]
-        if all(entry.value is not None for entry in entries):
+        if all(entry.value is not None for _, entry in named_entries(self.manifold)):
             return invalid_values
         # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
         # comparison is false, and its projection fails.
@@ -384,7 +383,7 @@ class ManifoldProjection(ForwardingSolver):
         starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
         off = lax.cond(
             any_lane(starts_elsewhere),
-            lambda: starts_off_manifold(target.problem(step.t0, step.y0), entries, step.y0),
+            lambda: starts_off_manifold(target.problem(step.t0, step.y0), self.manifold, step.y0),
             lambda: jnp.asarray(False),
         )
         return invalid_values | (starts_elsewhere & off)
