@@ -2,10 +2,10 @@
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` is its function.
 
-A residual in floating-point arithmetic is rarely exactly zero, so this file also says when it counts
-as zero. The roundoff of a residual is proportional to the size of the terms that cancel in it, its
-*scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the change of the residual by relative
-errors of `ε` in `I₀` and in each component of the state, divided by `ε`. Terms that cancel inside a
+A residual in floating-point arithmetic is rarely exactly zero. So this file also says when it
+counts as zero. The roundoff of a residual is proportional to the size of the terms that cancel in
+it, its *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the largest change of the residual
+by relative errors `ε` of `I₀` and of each component, divided by `ε`. Terms that cancel inside a
 function and leave no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum.
 The file `roundoff` measures them, and they are added as the *cancellation* of the scale. A
 component that has changed by `c_k` in a step of the solver is known to roundoff of `c_k` only,
@@ -282,18 +282,14 @@ def problem_of(
     its fields."""
     cancellation = jnp.zeros_like(values) if cancellation is None else cancellation
     like = jax.eval_shape(lambda: like)
-    vector, residuals, start = jax.eval_shape(ravel, like), [], 0
+    vector, residuals = jax.eval_shape(ravel, like), []
     functions = functions_of(manifold, t, like, args)
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
-    for fn, size in zip(functions, sizes, strict=True):
-
-        def residual(y: Array, fn=fn, start=start, end=start + size) -> Array:
-            return fn(y) - values[start:end]
-
+    for fn, size, stop in zip(functions, sizes, np.cumsum(sizes), strict=True):
+        residual = lambda y, fn=fn, value=values[stop - size : stop]: fn(y) - value  # noqa: E731
         # The user's function may close over arrays, such as the parameters of a network. Conversion
         # makes them leaves of the problem: only so can the custom rules differentiate by them.
         residuals.append(_Converted(eqx.filter_closure_convert(residual, vector)))
-        start += size
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     shapes = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
     return Problem(
