@@ -26,7 +26,7 @@ from .._numerics.report import ProjectionInfo
 from .._numerics.rows import solve_kkt
 from .._tree import eps_of, tree_stop_gradient
 from .options import NEWTON_OPTIONS
-from .within_bounds import AbstractNewton, Bounds, project_within
+from .within_bounds import AbstractNewton, Bounds, along_gradients
 
 
 @final
@@ -76,7 +76,7 @@ class Newton(AbstractNewton):
         given, start = _Given(problem.dense(), candidate, bounds), (bounds, problem, candidate)
         # Nobody uses the derivative of the first phase: that of the nearest point is by the second
         # one, and elsewhere it is NaN.
-        first_phase = ft.partial(project_within, max_steps=self.max_steps, iteration=damped_newton)
+        first_phase = ft.partial(along_gradients, max_steps=self.max_steps, iteration=damped_newton)
         if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
             first = first_phase(*start)
             y, more = nan_tangent_unless(given.clip(first.y), False), 0

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .options import NEWTON_OPTIONS
-from .within_bounds import AbstractNewton, project_within
+from .within_bounds import AbstractNewton, along_gradients
 
 
 @final
@@ -59,7 +59,7 @@ class SimplifiedNewton(AbstractNewton):
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         bounds = self.bounds(problem.like)
-        y, ok, count, _ = project_within(bounds, problem, candidate, max_steps=self.max_steps)
+        y, ok, count, _ = along_gradients(bounds, problem, candidate, max_steps=self.max_steps)
         y = y if bounds is None else bounds.clip(y)
         return y, problem.report(candidate, y, count, ok=ok)
 

@@ -62,7 +62,7 @@ def _clipped(bounds: Bounds, fn: Callable[[Array], Array], z: Array) -> Array:
     return fn(bounds.clip(z))
 
 
-def project_within(
+def along_gradients(
     bounds: Bounds | None,
     problem: Problem,
     candidate: Float[Array, " n"],
