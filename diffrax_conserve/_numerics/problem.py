@@ -282,14 +282,17 @@ def problem_of(
     its fields."""
     cancellation = jnp.zeros_like(values) if cancellation is None else cancellation
     like = jax.eval_shape(lambda: like)
-    vector, residuals = jax.eval_shape(ravel, like), []
+    vector = jax.eval_shape(ravel, like)
     functions = functions_of(manifold, t, like, args)
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
-    for fn, size, stop in zip(functions, sizes, np.cumsum(sizes), strict=True):
-        residual = lambda y, fn=fn, value=values[stop - size : stop]: fn(y) - value  # noqa: E731
-        # The user's function may close over arrays, such as the parameters of a network. Conversion
-        # makes them leaves of the problem: only so can the custom rules differentiate by them.
-        residuals.append(_Converted(eqx.filter_closure_convert(residual, vector)))
+
+    def converted(fn: Residual, size: int, stop: int) -> Residual:
+        """The residuals of an entry. The user's function may close over arrays, such as the
+        parameters of a network. Conversion makes them leaves of the problem: only so can the custom
+        rules differentiate by them."""
+        value = values[stop - size : stop]
+        return _Converted(eqx.filter_closure_convert(lambda y: fn(y) - value, vector))
+
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     shapes = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
     return Problem(
@@ -299,7 +302,7 @@ def problem_of(
         like=like,
         names=entry_names(manifold),
         keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
-        functions=tuple(residuals),
+        functions=tuple(map(converted, functions, sizes, np.cumsum(sizes))),
         sizes=tuple(sizes),
         magnitude=lax.stop_gradient(jnp.abs(values) + cancellation),
         cancellation=cancellation,
