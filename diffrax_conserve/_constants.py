@@ -33,7 +33,7 @@ MAX_UNROLLED = 4
 # five projections on the seven integrals of an orbit, of which five are independent, does not
 # converge.
 REGULARISATION_POWER = 3 / 4
-# The number of steps of iterative refinement that remove the effect of this shift.
+# The number of steps of iterative refinement, which remove the error that this addition makes.
 NUM_REFINEMENTS = 2
 # In a batch the sums over so many unknowns in a Gram matrix are written out. They take a third of
 # the time of a reduction; the program grows with them.
@@ -47,7 +47,7 @@ MAX_DENSE_SYSTEM = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
-# nothing is.
+# nothing is written out.
 MAX_SCALAR_OPERATIONS = 2048
 # Where most operations are expected to be none, as in a derivative of a derivative, so many times
 # as many are tried. Each takes about 5 µs.

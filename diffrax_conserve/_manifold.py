@@ -81,8 +81,8 @@ class Constraint(Hashable):
     """
 
     fn: ConstraintFn
-    # No field: its function stays zero.
-    rate = None
+    # No fields: its function is zero and stays so.
+    value = rate = None
 
     def __check_init__(self):
         check_function("`fn` of a `Constraint`", self.fn, "fn(t, y, args)", "real arrays")
@@ -234,7 +234,7 @@ def conserved_values(
     each other and the state.
     """
     entries, treedef = named_entries(manifold, root), jtu.tree_structure(manifold, is_leaf=is_entry)
-    values = [getattr(entry, "value", None) for _, entry in entries]
+    values = [entry.value for _, entry in entries]
     if given is not None:
         try:
             values = treedef.flatten_up_to(given)

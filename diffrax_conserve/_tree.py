@@ -21,11 +21,8 @@ def real_view(y: Any) -> Any:
     first one, an option such as a weight that broadcasts against the leaf broadcasts against the
     view too.
     """
-    return jtu.tree_map(lambda x: jnp.stack([jnp.real(x), jnp.imag(x)]) if _is_complex(x) else x, y)
-
-
-def _is_complex(x: Any) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.complexfloating)
+    parts = lambda x: jnp.stack([jnp.real(x), jnp.imag(x)]) if jnp.iscomplexobj(x) else x  # noqa: E731
+    return jtu.tree_map(parts, y)
 
 
 def tree_add(a: Y, b: Y) -> Y:
@@ -96,11 +93,11 @@ def irregular_weights(n: int, dtype: Any) -> Array:
 
 def ravel(y: Any) -> Any:
     """The components of `y` as one real vector, complex ones as real and imaginary parts."""
-    leaves = [jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))]
-    return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)
+    return jnp.concatenate([jnp.ravel(jnp.asarray(x)) for x in jtu.tree_leaves(real_view(y))])
 
 
 def unravel(vector: Any, like: Any) -> Any:
     """The state whose `ravel` is `vector`, with the structure, shapes and dtypes of `like`."""
     view = unflatten(vector, jax.eval_shape(real_view, like))
-    return jtu.tree_map(lambda v, x: lax.complex(v[0], v[1]) if _is_complex(x) else v, view, like)
+    whole = lambda v, x: lax.complex(v[0], v[1]) if jnp.iscomplexobj(x) else v  # noqa: E731
+    return jtu.tree_map(whole, view, like)

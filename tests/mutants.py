@@ -127,8 +127,8 @@ def take_the_conserved_value_anew_at_every_step(package):
     def _(step, self, terms, t0, t1, y0, args, state, made_jump):
         values = conserved_values(self.manifold, t0, y0, args)
         values = jax.flatten_util.ravel_pytree(values)[0]
-        constants = state.constants.at[: values.size].set(values)
-        state = dataclasses.replace(state, constants=constants)
+        constants = state.packed_constants.at[: values.size].set(values)
+        state = dataclasses.replace(state, packed_constants=constants)
         return step(self, terms, t0, t1, y0, args, state, made_jump)
 
 

@@ -11,7 +11,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
 from diffrax_conserve._dae.dae import _Constraints
 from diffrax_conserve._fast.arrays import folded
-from diffrax_conserve._fast.scalars import scalarised, small, written
+from diffrax_conserve._fast.scalars import scalarised, small, written_out
 
 from .test_scalars import equations_in, names_of_arrays
 
@@ -43,7 +43,8 @@ STEP = st.tuples(st.sampled_from(sorted(STEPS)), st.integers(0, 9), st.integers(
 
 def in_full(fn, *like):
     """`small`, also where the function is smaller in arrays."""
-    program = written(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, differentiated=True, zeros=True)
+    limit = lambda *_: MAX_SCALAR_OPERATIONS  # noqa: E731
+    program = written_out(fn, like, limit, differentiated=True, zeros=True)
     assert program is not None
     return program
 

@@ -46,7 +46,7 @@ def scalarised_result(fn: Callable[[Any], PyTree[Array]], y: Any) -> PyTree[Arra
     divided by their number.
     """
     limit = lambda size, _: MAX_SCALAR_OPERATIONS // max(1, size)  # noqa: E731
-    return (written(fn, (y,), limit, differentiated=True) or fn)(y)
+    return (written_out(fn, (y,), limit, differentiated=True) or fn)(y)
 
 
 def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[Array]]:
@@ -59,7 +59,7 @@ def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[
     derivatives by JAX.
     """
     limit = lambda _, in_arrays: min(MAX_SCALAR_OPERATIONS, in_arrays)  # noqa: E731
-    return written(fn, like, limit, differentiated=True, zeros=True) or fn
+    return written_out(fn, like, limit, differentiated=True, zeros=True) or fn
 
 
 def scalarised(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
@@ -68,10 +68,10 @@ def scalarised(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
     a derivative rule of its own is looked into, and its rule is lost.
     """
-    return written(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, arrays=False)
+    return written_out(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, arrays=False)
 
 
-def written(
+def written_out(
     fn: Callable[..., Any],
     like: Any,
     limit: Callable[[int, int], int],
@@ -91,11 +91,11 @@ def written(
     outs, out_treedef = jtu.tree_flatten(out)
     limited = limit(sum(x.size for x in outs), num_equations(closed))
     program = _Program(limited, differentiated, zeros)
-    given = [[program.given() for _ in range(1 if arrays else prod(x))] for x in shapes]
+    places = [[program.argument() for _ in range(1 if arrays else prod(x))] for x in shapes]
     try:
         inputs = [
-            program.taken_apart(i[0], x) if arrays else np.array(i, int).reshape(x)
-            for i, x in zip(given, shapes, strict=True)
+            program.elements(i[0], x) if arrays else np.array(i, int).reshape(x)
+            for i, x in zip(places, shapes, strict=True)
         ]
         found = [*zip(program.results(closed, inputs), outs, strict=True)]
         rows = [[program.array(i, x.dtype)] if arrays else i.ravel().tolist() for i, x in found]
@@ -117,72 +117,40 @@ def written(
     return evaluated
 
 
-def with_batch_flag(run: Callable[[Any, bool], Any]) -> Callable[[Any], Any]:
-    """`run(given, is_batched)` as a function of `given`.
-
-    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
-    steps of a solve several times. `run` returns arrays.
-    """
-
-    def call(given: Any) -> Any:
-        arrays, static = eqx.partition(given, eqx.is_array)
-
-        def variant(is_batched: bool) -> Callable[[Any], Any]:
-            return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
-
-        unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
-
-        @unbatched.def_vmap
-        def batched(size: int, axes: Any, arrays: Any) -> Any:
-            del size
-            (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
-            out = jax.vmap(lane, (axes,))(arrays)
-            return out, jtu.tree_map(lambda x: True, out)
-
-        return unbatched(arrays)
-
-    return call
-
-
-def with_lanes_last(run: Callable[[Any, Array, bool], Any]) -> Callable[[Any, Array], Any]:
-    """`run(each, y, is_batched)` as a function of `given` and `y`, where `each(fn)(*xs)` is
-    `fn(given, *xs)`.
+def with_lanes_last(run: Callable[[Any, Array, bool], Any], given: Any, y: Array) -> Any:
+    """`run(each, y, is_batched)`, where `each(fn)(*xs)` is `fn(given, *xs)`.
 
     In a batch the lanes are the last axis of `y`, of all `xs`, and of all results, so that an
     operation on small arrays is a loop over the lanes, which the processor does several at a time.
     With the lanes first, as `vmap` has them, its innermost loop is over the few elements of one.
     `each(fn)` maps a function of one lane over them, in scalars, if that is not too large.
     """
+    arrays, static = eqx.partition(given, eqx.is_array)
+    leaves, treedef = jtu.tree_flatten(arrays)
+    whole = lambda leaves: eqx.combine(treedef.unflatten(leaves), static)  # noqa: E731
 
-    def call(given: Any, y: Array) -> Any:
-        arrays, static = eqx.partition(given, eqx.is_array)
-        leaves, treedef = jtu.tree_flatten(arrays)
-        whole = lambda leaves: eqx.combine(treedef.unflatten(leaves), static)  # noqa: E731
+    @jax.custom_batching.custom_vmap
+    @jax.jit
+    def alone(leaves: Any, y: Array) -> Any:
+        return run(lambda fn: ft.partial(fn, whole(leaves)), y, False)
 
-        @jax.custom_batching.custom_vmap
-        @jax.jit
-        def alone(leaves: Any, y: Array) -> Any:
-            return run(lambda fn: ft.partial(fn, whole(leaves)), y, False)
+    @ft.partial(jax.jit, static_argnums=0)
+    def lanes(axes: tuple[int | None, ...], leaves: Any, y: Array) -> Any:
+        def each(fn: Callable[..., Any]) -> Callable[..., Any]:
+            of_leaves = lambda leaves, *xs: fn(whole(leaves), *xs)  # noqa: E731
+            return lambda *xs: _mapped(of_leaves, [*axes], leaves, xs)
 
-        @ft.partial(jax.jit, static_argnums=0)
-        def lanes(axes: tuple[int | None, ...], leaves: Any, y: Array) -> Any:
-            def each(fn: Callable[..., Any]) -> Callable[..., Any]:
-                of_leaves = lambda leaves, *xs: fn(whole(leaves), *xs)  # noqa: E731
-                return lambda *xs: _mapped(of_leaves, [*axes], leaves, xs)
+        out = run(each, jnp.moveaxis(y, 0, -1), True)
+        return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), out)
 
-            out = run(each, jnp.moveaxis(y, 0, -1), True)
-            return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), out)
+    @alone.def_vmap
+    def batched(size: int, axes: Any, leaves: Any, y: Array) -> Any:
+        of_leaves, of_y = axes
+        y = y if of_y else jnp.broadcast_to(y, (size, *y.shape))
+        out = lanes(tuple(0 if x else None for x in of_leaves), leaves, y)
+        return out, jtu.tree_map(lambda x: True, out)
 
-        @alone.def_vmap
-        def batched(size: int, axes: Any, leaves: Any, y: Array) -> Any:
-            of_leaves, of_y = axes
-            y = y if of_y else jnp.broadcast_to(y, (size, *y.shape))
-            out = lanes(tuple(0 if x else None for x in of_leaves), leaves, y)
-            return out, jtu.tree_map(lambda x: True, out)
-
-        return alone(leaves, y)
-
-    return call
+    return alone(leaves, y)
 
 
 def _mapped(fn: Callable[..., Any], axes: Any, leaves: Any, xs: tuple[Any, ...]) -> Any:
@@ -208,31 +176,11 @@ def _mapped(fn: Callable[..., Any], axes: Any, leaves: Any, xs: tuple[Any, ...])
     )
 
 
-def loop_in_scalars(
-    start: Callable[[Any], Any], advance: Callable[..., Any], y: Array, tests_left: Array
-) -> tuple[Callable[[Any], Any], Callable[..., Any], Any]:
-    """The functions of a loop, `first = start(y)` and `y, tests_left = advance(first, y,
-    tests_left)`, in scalars, with `y` as a tuple of them. They are returned as they are if one is
-    too large."""
-    first = jax.eval_shape(start, y)
-    starts, advances = scalarised(start, y), scalarised(advance, first, y, tests_left)
-    if starts is None or advances is None:
-        return start, advance, y
-    return starts, advances, components(y)
-
-
 def components(x: Array) -> Any:
     """The elements of an array; a scalar remains what it is."""
     if jnp.ndim(x) == 0:
         return x
     return tuple(jnp.unstack(jnp.reshape(x, -1))) if jnp.size(x) else ()
-
-
-def joined(like: Any, scalars: Any) -> Array:
-    """The array shaped like `like` with these elements."""
-    if not isinstance(scalars, tuple):
-        return scalars
-    return jnp.stack(scalars).reshape(like.shape) if scalars else jnp.zeros(like.shape, like.dtype)
 
 
 # An array of integers: where in the list of scalars the elements of an array are.
@@ -411,8 +359,8 @@ class _Program:
     def __init__(self, limit: int, differentiated: bool, zeros: bool):
         self.limit, self.differentiated, self.zeros = limit, differentiated, zeros
         self.num_operations = 0
-        # At each place: a number, an operation with the places of its operands, or `None` for what
-        # is given.
+        # At each place: a number, an operation with the places of its operands, or `None` for an
+        # argument.
         self.entries: list[Any] = []
         self.places: dict[Any, int] = {}  # of operations and numbers
         self.negated: dict[int, int] = {}  # the place of `x` by that of `-x`
@@ -420,7 +368,7 @@ class _Program:
         # a whole again, it need not be stacked.
         self.wholes: dict[int, tuple[int, _Places]] = {}
 
-    def given(self) -> int:
+    def argument(self) -> int:
         self.entries.append(None)
         return len(self.entries) - 1
 
@@ -428,7 +376,7 @@ class _Program:
         return walk(closed, inputs, self._constant, self._equation)
 
     def evaluation(self, results: list[int]) -> Callable[[list[Any]], list[Any]]:
-        """The results as a function of what is given."""
+        """The results as a function of the arguments."""
         needed, rest = set(), [*results]
         while rest:
             i = rest.pop()
@@ -439,8 +387,8 @@ class _Program:
             raise _NotWrittenOut
         entries, order = self.entries, sorted(needed)
 
-        def evaluate(given: list[Any]) -> list[Any]:
-            values = given + entries[len(given) :]
+        def evaluate(arguments: list[Any]) -> list[Any]:
+            values = arguments + entries[len(arguments) :]
             for i in order:
                 fn, row = entries[i]
                 values[i] = fn(*(values[j] for j in row))
@@ -557,12 +505,12 @@ class _Program:
         out = []
         for k, var in enumerate(eqn.outvars):
             one = self._operation("output", lambda xs, k=k: xs[k], (called,), k)
-            out.append(self.taken_apart(one, var.aval.shape))
+            out.append(self.elements(one, var.aval.shape))
         return out
 
     # ---- Arrays and their elements ----
 
-    def taken_apart(self, whole: int, shape: tuple[int, ...]) -> _Places:
+    def elements(self, whole: int, shape: tuple[int, ...]) -> _Places:
         """The places of the elements of an array whose own place is given."""
         if not shape:
             return np.array(whole)
@@ -600,7 +548,7 @@ class _Program:
         if _is_key(x):
             raise _NotWrittenOut
         if isinstance(x, jax.core.Tracer):
-            return self.taken_apart(self._operation(id(x), lambda: x, ()), x.shape)
+            return self.elements(self._operation(id(x), lambda: x, ()), x.shape)
         x = np.asarray(x)
         numbers = [*map(self._number, x.flat)]
         return np.array(numbers, int).reshape(x.shape)

@@ -240,13 +240,14 @@ def _solved(
     step. But the exact flow keeps integrals not only on the manifold but everywhere, `G₁ Φ' = G₀`.
     So both agree up to the error of the step, and no step needs to be differentiated.
     """
-    sizes, first = start.gradients(y0).scaled()
+    row_scales, first = start.gradients(y0).equilibrated()
     gram0, eps = first.gram(first), eps_of(y0)
 
     def stepped(multiplier: Array, rows: AbstractRows | None = None) -> _Unknowns:
         """The unknowns with this multiplier. The gradients at the end of the step are needed to
         compute that end, so they are those of the last unknowns, or at the candidate."""
-        candidate, result = inner(y0 + start.factor.to_state(first.rmatvec(multiplier * sizes)))
+        change = start.factor.to_state(first.rmatvec(multiplier * row_scales))
+        candidate, result = inner(y0 + change)
         rows = end.gradients(candidate) if rows is None else rows
         y = candidate + end.factor.to_state(rows.rmatvec(multiplier))
         return _Unknowns(y, multiplier, candidate, result)
@@ -268,9 +269,9 @@ def _solved(
         tests_left = jnp.where(now.result == dfx.RESULTS.successful, tests_left, -1)
 
         def move() -> _Unknowns:
-            scaled = rows.divide_rows(sizes)
+            scaled = rows.divide_rows(row_scales)
             gram = jtu.tree_map(jnp.add, gram0, scaled.gram(scaled))
-            change = gram.solve((to_correct + jacobian.matvec(defect)) / sizes) / sizes
+            change = gram.solve((to_correct + jacobian.matvec(defect)) / row_scales) / row_scales
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)

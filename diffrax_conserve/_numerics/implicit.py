@@ -26,7 +26,7 @@ from .rows import AbstractRows
 
 
 class AbstractSystem(eqx.Module):
-    """Equations for unknowns. What is not an array, such as an option, must be static."""
+    """Equations for unknowns."""
 
     @abc.abstractmethod
     def solved(self) -> Solved:
@@ -115,7 +115,7 @@ class MultiplierSystem(AbstractSystem):
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
-        row_norms, rows = self._directions_at(start).unit()
+        row_norms, rows = self._directions_at(start).normalised()
         change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
         return solved.ok, rows.least_squares_multiplier(change) / row_norms
 
@@ -137,8 +137,8 @@ class MultiplierSystem(AbstractSystem):
         t_y, t_g = t_equations
         problem, start = self.problem, self._start(solved.ok)
         y = jnp.where(solved.ok, solved.y, start)
-        row_norms, rows = problem.gradients(y).unit()
-        directions = self._directions_at(start).unit()[1]
+        row_norms, rows = problem.gradients(y).normalised()
+        directions = self._directions_at(start).normalised()[1]
         change = rows.gram(directions).row_space_correction(
             directions,
             t_g / row_norms,

@@ -12,8 +12,7 @@ is called a step of the solver.
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
   last state, so that the iteration is Newton's method; for more it is evaluated at the candidate.
-- `projected_newton` keeps a state within bounds. It is a semismooth Newton method along given
-  directions, with a line search.
+- `semismooth_newton` keeps a state within bounds, along given directions, with a line search.
 - `damped_newton` is for starts far away. Without given directions each step is the shortest, in the
   metric, that solves the equations linearised at the last state (P. Deuflhard, *Newton Methods for
   Nonlinear Problems*, Springer 2004, Section 4.4). A step that increases the largest residual, or
@@ -31,6 +30,7 @@ import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import (
@@ -41,7 +41,7 @@ from .._constants import (
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
 )
-from .._fast.scalars import joined, loop_in_scalars, with_batch_flag, with_lanes_last
+from .._fast.scalars import components, scalarised, with_lanes_last
 from .linear import (
     forward_elimination,
     gram_inverse,
@@ -89,8 +89,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
     the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
-    are done, for which no test is left, as they are. If their last axis are the lanes, `lanes` is
-    its shape, and there is a number of tests for each.
+    are done, for which no test is left, as they are. If the lanes are the last axis of the
+    unknowns, `lanes` is its shape, and each lane has a number of tests of its own.
     """
 
     def body(now: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
@@ -105,9 +105,8 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
 
 
 def initial_tests(max_steps: int) -> Int[Array, ""]:
-    """The number of tests at the start of an iteration, in a byte if it fits."""
-    fits = max_steps + 1 < jnp.iinfo(jnp.int8).max
-    return jnp.asarray(max_steps + 1, jnp.int8 if fits else jnp.int32)
+    """The number of tests at the start of an iteration, in the shortest signed integer."""
+    return jnp.asarray(max_steps + 1, np.min_scalar_type(-max_steps - 2))
 
 
 def left_after_test(level: Array, tests_left: Array, *, polish: bool = True) -> Array:
@@ -152,6 +151,29 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[
     return any_lane(jnp.any(flags)), False
 
 
+def with_batch_flag(run: Callable[[Any, bool], Any], given: Any) -> Any:
+    """`run(given, is_batched)`, a PyTree of arrays. The flag tells whether a `vmap` is around it.
+
+    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
+    steps of a solve several times.
+    """
+    arrays, static = eqx.partition(given, eqx.is_array)
+
+    def variant(is_batched: bool) -> Callable[[Any], Any]:
+        return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
+
+    unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
+
+    @unbatched.def_vmap
+    def batched(size: int, axes: Any, arrays: Any) -> Any:
+        del size
+        (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
+        out = jax.vmap(lane, (axes,))(arrays)
+        return out, jtu.tree_map(lambda x: True, out)
+
+    return unbatched(arrays)
+
+
 def where_active(tests_left: Array, moved: Any, y: Any) -> Any:
     """The moved unknowns where the iteration goes on, and the old ones where it is done."""
     return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
@@ -175,10 +197,9 @@ def simplified_newton(
         return _with_frozen_jacobian(problem, candidate, max_steps)
     if problem.magnitude.size > MAX_UNROLLED:
         run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
-        return with_lanes_last(run)(problem, candidate)
-    return with_batch_flag(ft.partial(_with_fresh_jacobians, max_steps=max_steps))(
-        (problem, candidate, directions)
-    )
+        return with_lanes_last(run, problem, candidate)
+    run = ft.partial(_with_fresh_jacobians, max_steps=max_steps)
+    return with_batch_flag(run, (problem, candidate, directions))
 
 
 def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> Solved:
@@ -191,7 +212,7 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     def loop_invariants(y: Any) -> Any:
         """The order in which all steps eliminate the constraints, and in this order the given
         directions, or the gradients at the candidate."""
-        rows = problem.gradients(y).scaled()[1]
+        rows = problem.gradients(y).equilibrated()[1]
         fixed = rows if directions is None else directions
         gram = rows.gram(fixed).matrix
         order = forward_elimination(gram, gram[0], gram)[2]
@@ -203,7 +224,7 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = linearised if is_batched else lax.optimization_barrier(linearised)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         rows, to_correct = permuted(order, rows.matrix), permuted(order, to_correct / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
         # We count by the number before `left_after_test`, which may set it to two for a step that
@@ -228,15 +249,18 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
         return where_active(tests_left, newton_point, y), tests_left
 
     if is_batched:
-        tests_left = initial_tests(max_steps)
-        # Unchanged, if the loop would be too large in scalars.
-        invariants_of, advance, y = loop_in_scalars(loop_invariants, advance, candidate, tests_left)
+        like = jax.eval_shape(loop_invariants, candidate), candidate, initial_tests(max_steps)
+        start, step = scalarised(loop_invariants, candidate), scalarised(advance, *like)
+        if start and step and candidate.size:
+            y = components(candidate)
+            solved = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
+            return solved._replace(y=jnp.stack(solved.y))
+        y = candidate
     else:
         # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
         # that step once for each use of the candidate.
-        invariants_of, y = loop_invariants, lax.optimization_barrier(candidate)
-    solved = iterate(ft.partial(advance, invariants_of(y)), y, max_steps=max_steps)
-    return solved._replace(y=joined(candidate, solved.y))
+        y = lax.optimization_barrier(candidate)
+    return iterate(ft.partial(advance, loop_invariants(y)), y, max_steps=max_steps)
 
 
 def _with_frozen_matrix(
@@ -252,7 +276,7 @@ def _with_frozen_matrix(
     def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
         g, jacobian = problem.linearise(y)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         return level, to_correct, row_scales, rows.matrix  # pyright: ignore
 
     def factored(row_scales: Array, rows: Array) -> Any:
@@ -296,7 +320,7 @@ def _with_frozen_jacobian(
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
     gradients = problem.factor.scale_columns(jacobian)
-    row_scales, rows = gradients.scaled()
+    row_scales, rows = gradients.equilibrated()
     solve = rows.gram(rows).factorise()
     _, vjp = jax.vjp(problem.residual, candidate)
 
@@ -356,7 +380,7 @@ def damped_newton(
         scale = jnp.where(is_first, scale_at_y, now.scale)
         residuals = jnp.abs(relative_to_scale(g, scale))
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         current = rows if directions is None else directions
         change = rows.gram(current).row_space_correction(current, to_correct / row_scales)
         newton_point = y - problem.factor.to_state(change)
@@ -374,7 +398,7 @@ def damped_newton(
 # ---- Within bounds ----
 
 
-def projected_newton(
+def semismooth_newton(
     problem: Problem, start: Float[Array, " n"], directions: AbstractRows, *, max_steps: int
 ) -> Solved:
     """A vector `z` along the given `directions` for which `clip(z)` is on the manifold.
@@ -389,7 +413,7 @@ def projected_newton(
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         level, _ = problem.level(g, problem.scale(jacobian, z))
         tests_left = left_after_test(level, tests_left, polish=False)
-        row_scales, rows = problem.factor.scale_columns(jacobian).scaled()
+        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = rows.gram(directions).solve(g / row_scales)

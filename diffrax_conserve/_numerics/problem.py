@@ -2,10 +2,10 @@
 
 For a first integral `g = I(t, y, args) - I₀`, for a constraint `g` is its function.
 
-A residual in floating-point arithmetic is never exactly zero, so this file also says when it counts
-as zero. The roundoff of a residual is proportional to the size of the terms that cancel in it, its
-*scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the change of the residual by relative
-errors of `ε` in `I₀` and in each component of the state, divided by `ε`. Terms that cancel inside a
+A residual in floating-point arithmetic is rarely exactly zero. So this file also says when it
+counts as zero. The roundoff of a residual is proportional to the size of the terms that cancel in
+it, its *scale*: `|I₀| + Σ_k |y_k ∂g/∂y_k|`. To first order it is the largest change of the residual
+by relative errors `ε` of `I₀` and of each component, divided by `ε`. Terms that cancel inside a
 function and leave no trace in its gradient, as in `1 - cos(q)` near zero, are missing in this sum.
 The file `roundoff` measures them, and they are added as the *cancellation* of the scale. A
 component that has changed by `c_k` in a step of the solver is known to roundoff of `c_k` only,
@@ -282,18 +282,17 @@ def problem_of(
     its fields."""
     cancellation = jnp.zeros_like(values) if cancellation is None else cancellation
     like = jax.eval_shape(lambda: like)
-    vector, residuals, start = jax.eval_shape(ravel, like), [], 0
+    vector = jax.eval_shape(ravel, like)
     functions = functions_of(manifold, t, like, args)
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
-    for fn, size in zip(functions, sizes, strict=True):
 
-        def residual(y: Array, fn=fn, start=start, end=start + size) -> Array:
-            return fn(y) - values[start:end]
+    def converted(fn: Residual, size: int, stop: int) -> Residual:
+        """The residuals of an entry. The user's function may close over arrays, such as the
+        parameters of a network. Conversion makes them leaves of the problem: only so can the custom
+        rules differentiate by them."""
+        value = values[stop - size : stop]
+        return _Converted(eqx.filter_closure_convert(lambda y: fn(y) - value, vector))
 
-        # The user's function may close over arrays, such as the parameters of a network. Conversion
-        # makes them leaves of the problem: only so can the custom rules differentiate by them.
-        residuals.append(_Converted(eqx.filter_closure_convert(residual, vector)))
-        start += size
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     shapes = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
     return Problem(
@@ -303,7 +302,7 @@ def problem_of(
         like=like,
         names=entry_names(manifold),
         keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
-        functions=tuple(residuals),
+        functions=tuple(map(converted, functions, sizes, np.cumsum(sizes))),
         sizes=tuple(sizes),
         magnitude=lax.stop_gradient(jnp.abs(values) + cancellation),
         cancellation=cancellation,
@@ -312,27 +311,19 @@ def problem_of(
     )
 
 
-class _Concrete:
-    """An array in a box, which JAX takes for a leaf that is no array. So no transformation replaces
-    it by a tracer, and its numbers remain known."""
-
-    def __init__(self, value: Any):
-        self.value = value
-
-
 class _Converted(eqx.Module):
     """A function after closure conversion, in which the integers over which it closes keep their
     values. They are usually indices, such as of `y[indices]`, and `scalars` can follow a function
-    that moves elements only if it knows the indices."""
+    that moves elements only if it knows the indices. For JAX the function `constants` is a leaf
+    that is no array, so that no transformation replaces what it returns by tracers."""
 
-    fn: Any
+    arrays: Any
+    constants: Callable[[], Any]
 
     def __init__(self, fn: Any):
-        def known(x: Any) -> Any:
-            constant = hasattr(x, "dtype") and not isinstance(x, jax.core.Tracer)
-            return _Concrete(x) if constant and not jnp.issubdtype(x.dtype, jnp.inexact) else x
-
-        self.fn = jtu.tree_map(known, fn)
+        is_variable = lambda x: isinstance(x, jax.core.Tracer) or eqx.is_inexact_array(x)  # noqa: E731
+        self.arrays, constants = eqx.partition(fn, is_variable)
+        self.constants = lambda: constants
 
     def __call__(self, y: Array) -> Array:
-        return jtu.tree_map(lambda x: x.value if isinstance(x, _Concrete) else x, self.fn)(y)
+        return eqx.combine(self.arrays, self.constants())(y)

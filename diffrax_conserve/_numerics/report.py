@@ -21,8 +21,8 @@ class ProjectionInfo(eqx.Module):
 
     - `ok`: whether the projection succeeded: every residual is within its tolerance at the state
         that is returned, and what else the projection asks of it holds.
-    - `result`: an `optimistix.RESULTS`, successful if and only if `ok`; `nonfinite` if the
-        candidate has no finite residual, divergence if only the result has none.
+    - `result`: an `optimistix.RESULTS`, successful if and only if `ok`; `nonfinite` if a
+        residual of the candidate is not finite, divergence if only one of the result is not.
     - `num_iterations`: the number of iterations.
     - `residual_before`, `residual_after`: the largest residual of the candidate and of the
         projected state, relative to the scale of its constraint at the latter,

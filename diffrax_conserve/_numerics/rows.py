@@ -89,7 +89,7 @@ class AbstractRows(eqx.Module):
         """`|U| x`."""
         return jtu.tree_map(jnp.abs, self).matvec(x)
 
-    def scaled(self: Rows) -> tuple[Float[Array, " m"], Rows]:
+    def equilibrated(self: Rows) -> tuple[Float[Array, " m"], Rows]:
         """The scales of the rows, and the rows divided by them. A scale is the largest element of
         its row, or one if all are zero.
 
@@ -102,15 +102,15 @@ class AbstractRows(eqx.Module):
         row_scales = jnp.where(row_scales > 0, row_scales, 1)
         return row_scales, self.divide_rows(row_scales)
 
-    def unit(self: Rows) -> tuple[Float[Array, " m"], Rows]:
+    def normalised(self: Rows) -> tuple[Float[Array, " m"], Rows]:
         """The norms of the rows, and the rows divided by them, so that the pivots of their Gram
-        matrix are squares of sines. Sparse rows are only `scaled`, because the pivots of a sparse
-        matrix are not compared with `pivot_tolerance`."""
-        return self.scaled()
+        matrix are squares of sines. Sparse rows are only equilibrated, because the pivots of a
+        sparse matrix are not compared with `pivot_tolerance`."""
+        return self.equilibrated()
 
     def derivative_pivot_tolerance(self) -> float:
-        """The least pivot of unit rows that counts in a derivative, `√ε`. As a pivot has an error
-        of about `ε`, half of the digits of what is divided by it are right."""
+        """The least pivot of normalised rows that counts in a derivative, `√ε`. As a pivot has an
+        error of about `ε`, half of the digits of what is divided by it are right."""
         return eps_of(self.dtype) ** 0.5
 
     def least_squares_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
@@ -195,11 +195,11 @@ class DenseRows(AbstractRows):
     def absolute_matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         return jnp.sum(jnp.abs(self.matrix) * x[None], axis=1)
 
-    def unit(self) -> tuple[Float[Array, " m"], "DenseRows"]:
-        row_scales, rows = self.scaled()
-        lengths = jnp.linalg.norm(rows.matrix, axis=1)
-        lengths = jnp.where(lengths > 0, lengths, 1)
-        return row_scales * lengths, rows.divide_rows(lengths)
+    def normalised(self) -> tuple[Float[Array, " m"], "DenseRows"]:
+        row_scales, rows = self.equilibrated()
+        norms = jnp.linalg.norm(rows.matrix, axis=1)
+        norms = jnp.where(norms > 0, norms, 1)
+        return row_scales * norms, rows.divide_rows(norms)
 
 
 class _DenseGram(AbstractGram):
@@ -313,8 +313,8 @@ def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Flo
     rows of `G` and columns of `B` are taken with the length one, so that nothing depends on the
     units of the multipliers.
     """
-    row_norms, rows = DenseRows(matrix[n:, :n]).unit()
-    column_norms, directions = DenseRows(matrix[:n, n:].T).unit()
+    row_norms, rows = DenseRows(matrix[n:, :n]).normalised()
+    column_norms, directions = DenseRows(matrix[:n, n:].T).normalised()
     columns = DenseRows(rows.matrix.T)
     factors = lu_factors(matrix[:n, :n] + columns.gram(columns).matrix)
     directions = DenseRows(lu_solution(factors, directions.matrix.T).T)

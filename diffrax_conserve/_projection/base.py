@@ -65,8 +65,8 @@ class AbstractProjection(Hashable):
 def with_options(
     problem: Problem, projection: AbstractProjection, y: Float[Array, " n"]
 ) -> Problem:
-    """The problem with the tolerances of a projection, and with its metric at a state, if it has
-    one; otherwise it keeps its own."""
+    """The problem with the tolerances of a projection, and with its metric at a state. If the
+    projection has no metric, the problem keeps its own."""
     changed: dict[str, Any] = dict(rtol=projection.rtol, atol=projection.atol)
     if projection.metric is not None:
         state = problem.state(y)

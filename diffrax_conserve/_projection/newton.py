@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
-from .._numerics.implicit import MultiplierSystem, implicit_solution, nan_tangent_unless, root
+from .._numerics.implicit import nan_tangent_unless, root
 from .._numerics.iterate import Solved, damped_newton
 from .._numerics.metric import Identity
 from .._numerics.problem import Problem
@@ -26,7 +26,7 @@ from .._numerics.report import ProjectionInfo
 from .._numerics.rows import solve_kkt
 from .._tree import eps_of, tree_stop_gradient
 from .options import NEWTON_OPTIONS
-from .within_bounds import AbstractNewton, Bounds, project_within
+from .within_bounds import AbstractNewton, Bounds, along_gradients
 
 
 @final
@@ -73,13 +73,15 @@ class Newton(AbstractNewton):
                 "state to float32, or pass `projection=SimplifiedNewton()`."
             )
         bounds = self.bounds(problem.like)
-        given = _Given(problem.dense(), candidate, bounds)
+        given, start = _Given(problem.dense(), candidate, bounds), (bounds, problem, candidate)
+        # Nobody uses the derivative of the first phase: that of the nearest point is by the second
+        # one, and elsewhere it is NaN.
+        first_phase = ft.partial(along_gradients, max_steps=self.max_steps, iteration=damped_newton)
         if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
-            first = _some_point(problem, given, self.max_steps)
+            first = first_phase(*start)
             y, more = nan_tangent_unless(given.clip(first.y), False), 0
         else:
-            problem, still = tree_stop_gradient((problem, given))
-            first = _some_point(problem, still, self.max_steps)
+            first = first_phase(*tree_stop_gradient(start))
             y, more = _nearest(given, first.y, self.max_steps)
         return y, problem.report(candidate, y, first.num_iterations + more)
 
@@ -98,25 +100,15 @@ class _Given(eqx.Module):
         return z if self.bounds is None else self.bounds.clip(z)
 
 
-def _some_point(problem: Problem, given: _Given, max_steps: int) -> Solved:
-    """First phase: some point of the manifold, within bounds before the clip. Nobody uses its
-    derivative: that of the nearest point is by the second phase, and elsewhere it is NaN."""
-    if given.bounds is not None:
-        return project_within(given.bounds, problem, given.candidate, max_steps=max_steps)
-    return implicit_solution(
-        MultiplierSystem(problem, given.candidate, iteration=damped_newton, max_steps=max_steps)
-    )
-
-
 class _Conditions(eqx.Module):
     """The Lagrange conditions as functions of one vector: the change `u` from a `base`, with
-    `y = base + S u`, and the multipliers times the lengths of the gradients there. So no unknown
-    has a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
+    `y = base + S u`, and the multipliers times the norms of the gradients there. So no unknown has
+    a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
     vector without bounds, which `clip` maps to the state."""
 
     given: _Given
     base: Float[Array, " n"]
-    lengths: Float[Array, " m"]
+    row_norms: Float[Array, " m"]
 
     def state(self, unknowns: Float[Array, " N"]) -> Float[Array, " n"]:
         # The base is only a place to start from. It moves with the candidate, and with nothing
@@ -130,7 +122,7 @@ class _Conditions(eqx.Module):
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
-        gradient = problem.factor.scale_gradient(vjp(multiplier / self.lengths)[0])
+        gradient = problem.factor.scale_gradient(vjp(multiplier / self.row_norms)[0])
         return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
 
 
@@ -139,8 +131,8 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     problem, y = given.problem, given.clip(base)
     jacobian = problem.linearise(y)[1]
-    lengths, rows = problem.factor.scale_columns(jacobian).unit()
-    conditions = _Conditions(given, base, lengths)
+    row_norms, rows = problem.factor.scale_columns(jacobian).normalised()
+    conditions = _Conditions(given, base, row_norms)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
     scale = problem.scale(jacobian, y)

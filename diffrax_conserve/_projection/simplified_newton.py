@@ -6,11 +6,10 @@ from typing import final
 
 from jaxtyping import Array, Float
 
-from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .options import NEWTON_OPTIONS
-from .within_bounds import AbstractNewton, project_within
+from .within_bounds import AbstractNewton, along_gradients
 
 
 @final
@@ -60,13 +59,8 @@ class SimplifiedNewton(AbstractNewton):
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         bounds = self.bounds(problem.like)
-        if bounds is None:
-            y, ok, count, _ = implicit_solution(
-                MultiplierSystem(problem, candidate, max_steps=self.max_steps)
-            )
-        else:
-            z, ok, count, _ = project_within(bounds, problem, candidate, max_steps=self.max_steps)
-            y = bounds.clip(z)
+        y, ok, count, _ = along_gradients(bounds, problem, candidate, max_steps=self.max_steps)
+        y = y if bounds is None else bounds.clip(y)
         return y, problem.report(candidate, y, count, ok=ok)
 
 

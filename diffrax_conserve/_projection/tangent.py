@@ -164,13 +164,13 @@ class TangentField(eqx.Module):
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
             """`M⁻¹ Gᵀ λ` and `λ`, where `G M⁻¹ Gᵀ λ = to_correct`. The rows of `G` are divided by
-            their sizes, and so is the right side."""
+            their scales, and so is the right side."""
             vector, to_correct = given
             _, jacobian = problem.linearise(vector)
-            sizes, rows = problem.factor.scale_columns(jacobian).scaled()
-            gram, right = rows.gram(rows), to_correct / sizes
+            row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
+            gram, right = rows.gram(rows), to_correct / row_scales
             change = problem.factor.to_state(gram.row_space_correction(rows, right))
-            return change, gram.solve(right) / sizes
+            return change, gram.solve(right) / row_scales
 
         correction, multiplier = scalarised_result(solved, (vector, to_correct))
         return slope, unravel(correction, y), unflatten(multiplier, values)

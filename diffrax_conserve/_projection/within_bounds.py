@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._constants import MAX_STEPS, SLOPE_BEYOND_BOUNDS
 from .._numerics.implicit import MultiplierSystem, implicit_solution
-from .._numerics.iterate import Solved, projected_newton
+from .._numerics.iterate import Solved, semismooth_newton, simplified_newton
 from .._numerics.metric import broadcast_option, positive_weights
 from .._numerics.problem import Problem
 from .._options import check_numbers
@@ -62,22 +62,31 @@ def _clipped(bounds: Bounds, fn: Callable[[Array], Array], z: Array) -> Array:
     return fn(bounds.clip(z))
 
 
-def project_within(
-    bounds: Bounds, problem: Problem, candidate: Float[Array, " n"], *, max_steps: int
+def along_gradients(
+    bounds: Bounds | None,
+    problem: Problem,
+    candidate: Float[Array, " n"],
+    *,
+    max_steps: int,
+    iteration: Callable[..., Solved] = simplified_newton,
 ) -> Solved:
-    """The projection along the gradients at the candidate, within bounds: the vector `z`, whose
-    `clip` is the state.
+    """The projection along the gradients, by an `iteration`; within bounds, if there are any, by a
+    semismooth Newton method, which returns a vector `z`, whose `clip` is the state.
 
     The candidate may be beyond the bounds, and so may `z`. The gradients are those at the candidate
     without the clip. A component that reaches its bound costs an iteration, so twice as many
     iterations are allowed.
     """
+    if bounds is None:
+        return implicit_solution(
+            MultiplierSystem(problem, candidate, iteration=iteration, max_steps=max_steps)
+        )
     rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
     functions = tuple(eqx.Partial(_clipped, bounds, fn) for fn in problem.functions)
     within = dataclasses.replace(problem, functions=functions, clip=bounds.clip)
     return implicit_solution(
         MultiplierSystem(
-            within, candidate, rows, iteration=projected_newton, max_steps=2 * max_steps
+            within, candidate, rows, iteration=semismooth_newton, max_steps=2 * max_steps
         )
     )
 

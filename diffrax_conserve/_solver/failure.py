@@ -68,15 +68,10 @@ def starts_off_manifold(
     scale = problem.scale(jacobian, y)
     limit = jnp.maximum(eps_of(y) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
-    counts = problem.per_residual([needs_consistent_start(entry) for entry in entries])
+    counts = problem.per_residual([entry.value is None for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
     unknown = jnp.isnan(limit) & ~is_constraint
     return jnp.any(counts & ~unknown & ~(jnp.abs(g) <= limit))
-
-
-def needs_consistent_start(entry: Any) -> bool:
-    """Whether the first state of a solve must be on an entry of the manifold."""
-    return isinstance(entry, Constraint) or entry.value is None
 
 
 def failure_cause(

@@ -31,7 +31,6 @@ from .failure import (
     failure_cause,
     is_shortest_step,
     masked_step,
-    needs_consistent_start,
     starts_off_manifold,
 )
 from .state import State, initial_values, updated_units
@@ -222,13 +221,13 @@ class ManifoldProjection(ForwardingSolver):
     ) -> tuple[Y, Y | None, DenseInfo, State, dfx.RESULTS]:
         state = self._checked(solver_state)
         wrapped = self._wrapped_step(terms, t0, t1, y0, args, state.inner, made_jump)
-        step, candidate = wrapped.step, wrapped.candidate
+        step, candidate, like = wrapped.step, wrapped.candidate, jax.eval_shape(lambda: y0)
         # Dense output stores the target at the start, and adds the integrals up to its own time.
-        state, start_target = self._target(terms, state, wrapped, y0, args)
+        state, start_target = self._target(terms, state, wrapped, like, args)
         target = start_target.add_rates(step.t0, step.t1, wrapped.path)
         y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
         metric = start_target.metric(step.t0, step.y0)
-        cause, is_final = self._verdict(start_target, state, wrapped, metric, y1, info, made_jump)
+        cause, is_final = self._failure(start_target, state, wrapped, metric, y1, info, made_jump)
         y1, result = masked_step(cause, y1, wrapped.result)
         dense_info = dict(
             inner=wrapped.dense_info,
@@ -247,7 +246,7 @@ class ManifoldProjection(ForwardingSolver):
             statistics=state.statistics.add(info, error_norm),
         )
         error = error_for_controller(cause, is_final, wrapped.error)
-        return unravel(y1, y0), error, dense_info, state, result
+        return unravel(y1, like), error, dense_info, state, result
 
     def _wrapped_step(
         self,
@@ -306,7 +305,7 @@ class ManifoldProjection(ForwardingSolver):
         terms: PyTree[dfx.AbstractTerm],
         state: State,
         wrapped: "_WrappedStep",
-        like: Y,
+        like: Any,
         args: Args,
     ) -> tuple[State, Target]:
         """The solver state with the units and displacements of this step, and the target at the
@@ -324,7 +323,7 @@ class ManifoldProjection(ForwardingSolver):
         target = Target(
             self.projection,
             self.manifold,
-            jax.eval_shape(lambda: like),
+            like,
             state.values,
             state.cancellation,
             args,
@@ -336,7 +335,7 @@ class ManifoldProjection(ForwardingSolver):
         state = dataclasses.replace(state, units=units, displacements=displacements)
         return state, target.absorb_rate_roundoff(step.t0, step.y0)
 
-    def _verdict(
+    def _failure(
         self,
         target: Target,
         state: State,
@@ -375,8 +374,7 @@ class ManifoldProjection(ForwardingSolver):
         tested where the state is not the end of the last step, as at the start of a solve, and
         after a jump of the vector field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
-        entries = [entry for _, entry in named_entries(self.manifold)]
-        if not any(map(needs_consistent_start, entries)):
+        if all(entry.value is not None for _, entry in named_entries(self.manifold)):
             return invalid_values
         # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
         # comparison is false, and its projection fails.
@@ -385,7 +383,7 @@ class ManifoldProjection(ForwardingSolver):
         starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
         off = lax.cond(
             any_lane(starts_elsewhere),
-            lambda: starts_off_manifold(target.problem(step.t0, step.y0), entries, step.y0),
+            lambda: starts_off_manifold(target.problem(step.t0, step.y0), self.manifold, step.y0),
             lambda: jnp.asarray(False),
         )
         return invalid_values | (starts_elsewhere & off)

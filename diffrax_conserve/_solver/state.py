@@ -62,7 +62,7 @@ def initial_values(
 
 
 def updated_units(
-    units: Float[Array, " n"], change: Float[Array, " n"], end: Float[Array, " n"], like: Y
+    units: Float[Array, " n"], change: Float[Array, " n"], end: Float[Array, " n"], like: Any
 ) -> Float[Array, " n"]:
     """The units of the metric of motion after a step to `end` that changed the components by
     `change`, for states like `like`.
@@ -83,7 +83,7 @@ def updated_units(
     return jnp.maximum(units, size * jnp.sqrt(ratio))
 
 
-def largest_of_quantity(x: Float[Array, " n"], like: Y) -> Float[Array, " n"]:
+def largest_of_quantity(x: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
     """Each component of `x` replaced by the largest of its quantity, where `x` is the `ravel` of a
     state like `like`.
 

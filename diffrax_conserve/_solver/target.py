@@ -100,24 +100,22 @@ class Target(eqx.Module):
             values = values + self.rate_integrals[0]
             decrease = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
             cancellation = cancellation + decrease
-        step = step if self.projection.sees_step else None
-        problem = problem_of(
+        factor = self.metric(t, y)
+        if self.displacements is not None:
+            factor = PreferredSubspace.spanned_by(factor, self.displacements)
+        return problem_of(
             self.manifold,
             values,
             t,
             self.like,
             self.args,
             cancellation,
-            factor=self.metric(t, y),
+            factor=factor,
             changes=self.changes,
-            step=step,
+            step=step if self.projection.sees_step else None,
             rtol=self.projection.rtol,
             atol=self.projection.atol,
         )
-        if self.displacements is None:
-            return problem
-        factor = PreferredSubspace.spanned_by(problem.factor, self.displacements)
-        return dataclasses.replace(problem, factor=factor)
 
     def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:
         """The factor of the metric of the projection at a state, without a preferred subspace."""
