@@ -19,14 +19,19 @@ class Hashable(eqx.Module):
     """
 
     def __hash__(self) -> int:
-        leaves, structure = jtu.tree_flatten(self)
-        return hash((structure, *map(_hash_of_leaf, leaves)))
+        return hash_of(self)
 
     def __eq__(self, other: object) -> bool:  # pyright: ignore[reportIncompatibleMethodOverride]
         if type(self) is not type(other):
             return False
         (ours, structure), (others, other_structure) = map(jtu.tree_flatten, (self, other))
         return structure == other_structure and all(map(_same_leaf, ours, others))
+
+
+def hash_of(tree: Any) -> int:
+    """A hash of a tree, the same for arrays of the same shape and dtype."""
+    leaves, structure = jtu.tree_flatten(tree)
+    return hash((structure, *map(_hash_of_leaf, leaves)))
 
 
 def is_array(x: Any) -> bool:

@@ -26,7 +26,7 @@ from .._hashable import Hashable
 from .._interpolation import AsArrays
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, iterate, left_after_test, where_active
+from .._numerics.iterate import Solved, any_lane, iterate, left_after_test, where_active
 from .._numerics.linear import Solve, iterative_refinement
 from .._numerics.metric import Diagonal, broadcast_option
 from .._numerics.problem import Problem, problem_of
@@ -34,7 +34,7 @@ from .._numerics.rows import AbstractGram, AbstractRows, solve_dense
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
 from .._solver.failure import failure_cause, masked_step, starts_off_manifold
-from .._solver.state import initial_values
+from .._solver.state import StepEnd, initial_values
 from .._solver.terms import in_field_time, is_backsolve, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, tree_shapes, unflatten, unravel
@@ -60,7 +60,8 @@ class _State(eqx.Module):
     - `slope`: the acceleration by the forces at its start, or with momenta the forces.
     - `multiplier`: the multiplier of the last step, the guess for the next.
     - `cancellation`: the part of the scales that the gradients do not show.
-    - `off`: whether the start of the solve was off the constraint, so that every step fails.
+    - `off`: whether a start was off the constraint, so that every step fails.
+    - `last_end`: the end of the last step.
     """
 
     at: _Linear
@@ -68,6 +69,7 @@ class _State(eqx.Module):
     multiplier: Float[Array, " m"]
     cancellation: Float[Array, " m"]
     off: Bool[Array, ""]
+    last_end: StepEnd
 
 
 @final
@@ -202,6 +204,16 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
             )
         terms, t0 = in_field_time(terms, t0)
         _, cancellation = initial_values(self.constraint, t0, q, args)
+        at, slope, off = self._started(terms, t0, y0, args, cancellation)
+        end = StepEnd.before_first(self.constraint, cancellation.dtype)
+        end = end.moved(t0, ravel(y0), args, self.constraint)
+        return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off, end)
+
+    def _started(
+        self, terms: Any, t0: RealScalarLike, y0: Y, args: Args, cancellation: Array
+    ) -> tuple[_Linear, PyTree[Array], Bool[Array, ""]]:
+        """What a start determines of a state: `at`, `slope` and `off`."""
+        q, v = y0
         problem = self._problem(t0, q, args, cancellation)
         drift = self._drift(terms, t0, v, args)
         at, rate = self._linear(problem, t0, q, args, drift, ravel(v))
@@ -214,8 +226,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         moves = rate + at.jacobian.matvec(drift(ravel(v)))
         off = ~jnp.all(jnp.abs(moves) <= eps_of(moves) ** 0.5 * limit)
         off = off | starts_off_manifold(problem, self.constraint, ravel(q))
-        slope = terms[1].vf(t0, q, args)
-        return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off)
+        return at, terms[1].vf(t0, q, args), off
 
     @eqx.filter_jit  # traced once; diffrax alone traces a step three times
     def step(
@@ -229,15 +240,20 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         made_jump: BoolScalarLike,
     ) -> tuple[Y, None, DenseInfo, _State, dfx.RESULTS]:
         state, (q0, v0) = solver_state, y0
-        q, v, at = ravel(q0), ravel(v0), state.at
+        q, v = ravel(q0), ravel(v0)
         given_terms, (terms, t0, t1) = terms, in_field_time(terms, t0, t1)
         h, per_step = t1 - t0, 1 / nonzero_length(t0, t1)
         middle = t0 + (t1 - t0) / 2
         drift = self._drift(terms, middle, v0, args)
-        slope = lax.cond(
-            jnp.asarray(made_jump), lambda: terms[1].vf(t0, q0, args), lambda: state.slope
-        )
-        state = dataclasses.replace(state, slope=slope)  # dense output needs it too
+        old = state.at, state.slope, state.off
+        changed = state.last_end.differs(t0, ravel(y0), args, self.constraint) | made_jump
+
+        def anew() -> Any:
+            new = self._started(terms, t0, y0, args, state.cancellation)
+            return jax.tree.map(ft.partial(jnp.where, changed), new, old)
+
+        at, slope, off = lax.cond(any_lane(changed), anew, lambda: old)
+        state = dataclasses.replace(state, at=at, slope=slope, off=off)  # for dense output too
 
         problem = self._problem(t1, q0, args, state.cancellation)
         kicked = _barrier(v + h / 2 * ravel(slope))
@@ -265,11 +281,12 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         v1, keeps = _on_tangent(problem, at, rate, drift, kicked)
 
         ok = found & keeps
-        cause = failure_cause(ok, state.off, state.cancellation, jnp.concatenate([q1, v1]))
+        cause = failure_cause(ok, off, state.cancellation, jnp.concatenate([q1, v1]))
         (q1, v1), result = masked_step(cause, (q1, v1), dfx.RESULTS.successful)
         dense_info = dict(y0=y0, step=AsArrays(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
-        state = _State(at, slope, multiplier, state.cancellation, state.off)
+        end = state.last_end.moved(t1, jnp.concatenate([q1, v1]), args, self.constraint)
+        state = _State(at, slope, multiplier, state.cancellation, off, end)
         return (unravel(q1, q0), unravel(v1, v0)), None, dense_info, state, result
 
     def _problem(self, t: RealScalarLike, q: Y, args: Args, cancellation: Array) -> Problem:

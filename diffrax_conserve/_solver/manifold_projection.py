@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .._balance import has_rates
-from .._constants import ROUNDOFF
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import AsArrays, MakeManifoldInterpolation
 from .._manifold import Constraint, check_manifold, entry_names, named_entries
@@ -25,7 +24,7 @@ from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
 from .._time import FieldTime
-from .._tree import eps_of, irregular_weights, ravel, tree_add, unravel
+from .._tree import ravel, tree_add, unravel
 from .failure import (
     error_for_controller,
     failure_cause,
@@ -33,7 +32,7 @@ from .failure import (
     masked_step,
     starts_off_manifold,
 )
-from .state import State, initial_values, updated_units
+from .state import State, StepEnd, initial_values, updated_units
 from .statistics import ProjectionStatistics
 from .target import Path, Target
 from .terms import (
@@ -201,7 +200,7 @@ class ManifoldProjection(ForwardingSolver):
             if has_rates(self.manifold)
             else None,
             units=jnp.zeros_like(y),
-            last_checksum=jnp.full((), jnp.inf, y.dtype),
+            last_end=StepEnd.before_first(self.manifold, y.dtype),
             statistics=statistics,
             displacements=first_displacements(terms, t0, t1, y0, args)
             if self.keep_linear
@@ -242,7 +241,7 @@ class ManifoldProjection(ForwardingSolver):
             state,
             inner=wrapped.inner,
             rate_integrals=target.rate_integrals,
-            last_checksum=_checksum(y1)[0],
+            last_end=state.last_end.moved(step.t1, y1, args, self.manifold),
             statistics=state.statistics.add(info, error_norm),
         )
         error = error_for_controller(cause, is_final, wrapped.error)
@@ -333,7 +332,7 @@ class ManifoldProjection(ForwardingSolver):
             displacements=displacements,
         )
         state = dataclasses.replace(state, units=units, displacements=displacements)
-        return state, target.absorb_rate_roundoff(step.t0, step.y0)
+        return state, target.balanced(step.t0, step.y0)
 
     def _failure(
         self,
@@ -357,7 +356,7 @@ class ManifoldProjection(ForwardingSolver):
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_norm(step.y0, candidate, metric)
             too_far = metric.norm(correction) > limit
-        is_first_step = jnp.isinf(state.last_checksum)
+        is_first_step = jnp.isinf(state.last_end.checksums[0])
         return failure_cause(
             info.ok,
             cannot_start,
@@ -371,29 +370,18 @@ class ManifoldProjection(ForwardingSolver):
         self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off the manifold. The second is
-        tested where the state is not the end of the last step, as at the start of a solve, and
-        after a jump of the vector field, because a constraint may jump with it."""
+        tested at the start of a solve, also of one that goes on, and after a jump of the vector
+        field, because a constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         if all(entry.value is not None for _, entry in named_entries(self.manifold)):
             return invalid_values
-        # XLA may add in another order, so we compare up to roundoff. For a state that is NaN the
-        # comparison is false, and its projection fails.
-        checksum, size = _checksum(step.y0)
-        roundoff = ROUNDOFF * eps_of(size) * size
-        starts_elsewhere = (jnp.abs(checksum - state.last_checksum) > roundoff) | made_jump
+        changed = state.last_end.differs(step.t0, step.y0, target.args, self.manifold) | made_jump
         off = lax.cond(
-            any_lane(starts_elsewhere),
+            any_lane(changed),
             lambda: starts_off_manifold(target.problem(step.t0, step.y0), self.manifold, step.y0),
             lambda: jnp.asarray(False),
         )
-        return invalid_values | (starts_elsewhere & off)
-
-
-def _checksum(y: Float[Array, " n"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """A weighted sum of the components, by which a state is recognised, and the sum of the absolute
-    terms, to which its roundoff is proportional."""
-    terms = irregular_weights(y.size, y.dtype) * y
-    return jnp.sum(terms), jnp.sum(jnp.abs(terms))
+        return invalid_values | (changed & off)
 
 
 def first_displacements(

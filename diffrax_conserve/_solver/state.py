@@ -1,17 +1,23 @@
 """The solver state of a `ManifoldProjection`, and how each solver that keeps a manifold starts."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float
 
+from .._constants import ROUNDOFF
 from .._custom_types import Args, Manifold, RealScalarLike, Y
+from .._hashable import hash_of
 from .._manifold import conserved_values
 from .._numerics.roundoff import cancellation_scale
-from .._tree import eps_of, ravel, real_view, unflatten
+from .._options import dtype_of
+from .._tree import eps_of, irregular_weights, ravel, real_view, unflatten
 from .statistics import ProjectionStatistics
 
 
@@ -25,8 +31,7 @@ class State(eqx.Module):
     - `rate_integrals`: as in a `Target`.
     - `units`: the unit of each component in the metric of motion, see `updated_units`, the largest
       of all steps so far; zero before the first step.
-    - `last_checksum`: a checksum of the state at the end of the last step; infinite before the
-      first step.
+    - `last_end`: the end of the last step.
     - `displacements`: those in the last two steps, as in a `Target`; `None` unless linear
       invariants are kept.
     """
@@ -35,7 +40,7 @@ class State(eqx.Module):
     packed_constants: Float[Array, " constants"]
     rate_integrals: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
-    last_checksum: Float[Array, ""]
+    last_end: "StepEnd"
     statistics: ProjectionStatistics
     displacements: Float[Array, "k n"] | None
 
@@ -50,6 +55,59 @@ class State(eqx.Module):
     @property
     def first_step_size(self) -> Float[Array, ""]:
         return self.packed_constants[-1]
+
+
+class StepEnd(eqx.Module):
+    """The end of a step, by which the next one recognises that nothing has changed in between. At
+    the start of a solve, and in a solve that goes on from a solver state with another state, time,
+    `args` or manifold, something has.
+
+    - `checksums`: the checksums of the state and of all numbers in `args` and in the manifold, and
+      the time; infinite before the first step. They are one array, as `packed_constants` are.
+    - `manifold_hash`: by which the functions of the manifold are recognised.
+    """
+
+    checksums: Float[Array, "3"]
+    manifold_hash: int = eqx.field(static=True)
+
+    @classmethod
+    def before_first(cls, manifold: Manifold, dtype: Any) -> "StepEnd":
+        return cls(jnp.full(3, jnp.inf, dtype), hash_of(manifold))
+
+    def moved(
+        self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
+    ) -> "StepEnd":
+        sums, _ = self._checksums(t, y, args, manifold)
+        return dataclasses.replace(self, checksums=sums)
+
+    def differs(
+        self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
+    ) -> Bool[Array, ""]:
+        """Whether it is another one than that of these values. XLA may add in another order, so
+        sums are compared up to roundoff. For a state that is NaN the comparison is false, and its
+        projection fails."""
+        if self.manifold_hash != hash_of(manifold):
+            return jnp.asarray(True)
+        sums, sizes = self._checksums(t, y, args, manifold)
+        return jnp.any(jnp.abs(sums - self.checksums) > ROUNDOFF * eps_of(y) * sizes)
+
+    def _checksums(
+        self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
+    ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
+        """Weighted sums of numbers, and the sums of the absolute terms, to which their roundoff is
+        proportional. `args` may hold many numbers, so their weights are no array in the program:
+        1, 2, 3, ... times one for each leaf."""
+        dtype = self.checksums.dtype
+        terms = [[irregular_weights(y.size, dtype) * y], [], [jnp.asarray(t, dtype)]]
+        kinds, leaves = (np.number, np.bool_), jtu.tree_leaves((args, manifold))
+        numbers = [x for x in leaves if any(jnp.issubdtype(dtype_of(x), kind) for kind in kinds)]
+        for weight, x in zip(irregular_weights(len(numbers), dtype), numbers, strict=True):
+            x = ravel(x) if jnp.iscomplexobj(x) else jnp.ravel(jnp.asarray(x, dtype))
+            terms[1].append(weight * jnp.arange(1, x.size + 1, dtype=dtype) * x.astype(dtype))
+        total = lambda xs: sum((jnp.sum(x) for x in xs), jnp.zeros((), dtype))  # noqa: E731
+        terms = lax.stop_gradient(terms)
+        sums = jnp.stack([total(xs) for xs in terms])
+        return sums, jnp.stack([total(map(jnp.abs, xs)) for xs in terms])
 
 
 def initial_values(

@@ -58,35 +58,35 @@ class Target(eqx.Module):
         """
         if self.rate_integrals is None:
             return self
-        last, compensation = self.rate_integrals
         states = lambda t: unravel(path(t), self.like)  # noqa: E731
-        increment = integrated_rates(self.manifold, start, end, states, self.args)
-        increment = ravel(increment).astype(last.dtype) - compensation
+        return self._plus(ravel(integrated_rates(self.manifold, start, end, states, self.args)))
+
+    def _plus(self, increment: Float[Array, " m"]) -> "Target":
+        assert self.rate_integrals is not None
+        last, compensation = self.rate_integrals
+        increment = increment.astype(last.dtype) - compensation
         total = last + increment
         return dataclasses.replace(
             self, rate_integrals=jnp.stack([total, (total - last) - increment])
         )
 
-    def absorb_rate_roundoff(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
-        """The target with values that a state `y` on the manifold can keep.
+    def balanced(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
+        """The target with balances that hold at a state `y`, the start of a step, up to half of
+        what counts as noise.
 
         The rate of a balance may vanish, for example when friction has stopped a pendulum. Its
         integral then keeps an error of roundoff, say an energy of -1e-17, which no state has: all
-        later projections would fail. So where the residual at the start of a step is within the
-        tolerance, but larger than half of what counts as noise, the conserved value is moved until
-        the residual is that half.
+        later projections would fail. And a solve that goes on from an event inside of a step has
+        the integrals up to the end of that step. In both cases a balance goes on from the state.
         """
         if self.rate_integrals is None:
             return self
         problem, y = tree_stop_gradient((self.problem(t, y), y))
         residual, jacobian = problem.linearise(y)
-        limit = problem.tolerance(problem.scale(jacobian, y))
-        is_small = (self.rate_integrals[0] != 0) & (jnp.abs(residual) <= limit)
-        half_noise = NOISE / ROUNDOFF * limit / 2
-        follow = jnp.where(is_small, residual - jnp.clip(residual, -half_noise, half_noise), 0)
-        # `add_rates` subtracts the second row from the next increment, so that `-follow` there
-        # raises the value by `follow`.
-        return dataclasses.replace(self, rate_integrals=self.rate_integrals.at[1].add(-follow))
+        half_noise = NOISE / ROUNDOFF * problem.tolerance(problem.scale(jacobian, y)) / 2
+        follow = residual - jnp.clip(residual, -half_noise, half_noise)
+        goes_on = (self.rate_integrals[0] != 0) & jnp.isfinite(residual)
+        return self._plus(jnp.where(goes_on, follow, 0))
 
     def problem(
         self, t: RealScalarLike, y: Float[Array, " n"], step: Step | None = None

@@ -153,6 +153,28 @@ def test_saved_times_are_on_the_constraint_and_dense_output_meets_the_states():
     assert difference(slope, v) < 0.01
 
 
+@pytest.mark.parametrize(("length", "speed"), [(1.0, 1.0), (1.0, -0.8), (1.2, 1.0)])
+def test_a_solve_that_goes_on_equals_a_new_one(length, speed):
+    """After an impact too; where the new one is refused, because a rod has become longer, so is
+    the other."""
+    solver = dfc.RATTLE(dfc.Constraint(lambda t, q, args: jnp.sum(q**2)[None] - args**2), 1.0)
+
+    def run(y0, t0, length, state=None):
+        options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), solver_state=state)
+        args = jnp.asarray(length)
+        return problems.solve(
+            terms(fall), solver, y0, t0=t0, t1=t0 + 1, args=args, **TO_THE_END, **options
+        )
+
+    first = run(chain(1), 0.0, 1.0)
+    q, v = final(first)
+    new, on = (run((q, speed * v), 1.0, length, x) for x in (None, first.solver_state))
+    assert bool(new.result == dfx.RESULTS.successful) is (length == 1)
+    assert on.result == new.result
+    # The multiplier of the last step is the first guess.
+    np.testing.assert_allclose(*map(final, (on, new)), rtol=0, atol=1e-14)
+
+
 @pytest.mark.slow
 def test_dense_output_meets_the_state_after_a_jump_of_the_force():
     save = dfx.SaveAt(t1=True, solver_state=True, dense=True)

@@ -5,6 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from scipy.integrate import solve_ivp
 
@@ -12,7 +13,7 @@ import diffrax_conserve as dfc
 import diffrax_conserve.testing as dct
 
 from .. import problems
-from ..problems import EPS, drift_of, evaluated, largest
+from ..problems import EPS, difference, drift_of, evaluated, largest
 from ..thinned import some_of
 
 
@@ -94,6 +95,19 @@ def test_derivatives_are_those_of_differences():
     dct.assert_gradients(end, Y0, ARGS, rtol=1e-6, forward=False)
 
 
+def test_a_solve_goes_on_from_an_event_inside_of_a_step():
+    """The solver state has the integral of the rate up to the end of that step."""
+    event = dfx.Event(lambda t, y, args, **kwargs: y[1], optx.Newton(1e-12, 1e-12))
+    saveat = dfx.SaveAt(t1=True, solver_state=True)
+    first = solve(event=event, saveat=saveat)
+    y, t0 = last_of(first), first.ts[-1]
+    assert 0 < t0 < 2
+    options = dict(t0=t0, t1=t0 + 1, saveat=saveat)
+    new, on = (solve(y, solver_state=x, **options) for x in (None, first.solver_state))
+    # The metric of the one that goes on has seen more steps.
+    assert difference(last_of(new), last_of(on)) < 1e-6
+
+
 @pytest.mark.slow
 def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     """A friction that takes less than a unit of roundoff of the energy in each step."""
@@ -104,7 +118,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     options = dict(manifold=None, solver=dfx.Dopri8()) | PRECISE
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, **options)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))
-    # The value follows a state that is off by roundoff, see `Target.absorb_rate_roundoff`.
+    # The value follows a state that is off by roundoff, see `Target.balanced`.
     assert gained == pytest.approx(lost, rel=0.1)  # without the second row nothing is gained
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import diffrax_conserve as dfc
 
-from ..problems import EPS, assert_lanes, largest, refused
+from ..problems import EPS, assert_lanes, difference, largest, refused
 from ..thinned import some_of
 
 
@@ -103,6 +103,23 @@ def test_a_derivative_of_the_consistent_state():
 
 
 @pytest.mark.slow
+def hanging(t, y, dy, args):
+    (q, v, force), (dq, dv, _) = y, dy
+    return dq - v, dv + force * q + jnp.array([0.0, 9.81]), jnp.sum(q**2) - 1
+
+
+HANGING = dfc.DAE(residual=hanging)
+
+
+@pytest.mark.parametrize("little", [0.0, 1e-16, -1e-16, 1e-12, 1e-9])
+def test_a_pendulum_at_its_lowest_point_keeps_its_velocity(little):
+    """Whether a component is zero or nearly so changes no other."""
+    guess = jnp.array([little, -1.0]), jnp.array([2.4, little / 7]), jnp.array(0.0)
+    q, v, force = HANGING.consistent(guess)
+    assert difference((q, v), guess[:2]) <= 4 * abs(little) + 1e-15
+    assert float(force) == pytest.approx(9.81 + 2.4**2)
+
+
 def test_one_lane_equals_that_lane_alone():
     lanes = jnp.stack([jnp.linspace(0.5, 3, 3), jnp.linspace(0.2, 1, 3)], axis=1)
     assert_lanes(lambda lane: ends(*lane, dfx.ForwardMode()), lanes, 4 * EPS)

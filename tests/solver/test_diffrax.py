@@ -119,6 +119,39 @@ def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another()
     assert "a step cannot start" in dfx.RESULTS[struck.result]
 
 
+def growing(more=0.0):
+    """`|y|² = args (1 + t)`, for the field below."""
+    return dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - args * (1 + t) - more)
+
+
+@pytest.mark.parametrize(
+    ("changed", "fits"),
+    [
+        ({}, True),
+        ({"law": growing()}, True),
+        ({"law": growing(0.1)}, False),
+        ({"args": 2.0}, False),
+        ({"t0": 1.5}, False),
+    ],
+    ids=["nothing", "the same law", "another law", "args", "t0"],
+)
+def test_what_a_new_solve_refuses_is_refused_by_one_that_goes_on(changed, fits):
+    """With the end of the first solve as its start, and one thing changed."""
+    law = growing()
+
+    def run(y0, t0=1.0, args=1.0, law=law, **options):
+        solver = dfc.ManifoldProjection(dfx.Heun(), law)
+        options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False) | options
+        field = lambda t, y, args: y / (2 * (1 + t))  # noqa: E731
+        return solve(field, solver, y0, t0=t0, t1=t0 + 1, args=jnp.asarray(args), **options)
+
+    first = run(jnp.array([1.0, 0.0]), t0=0.0)
+    new, on = (run(first.ys[-1], **changed, solver_state=x) for x in (None, first.solver_state))
+    assert on.result == new.result
+    assert bool(new.result == dfx.RESULTS.successful) is fits
+    np.testing.assert_allclose(on.ys, new.ys, rtol=1e-15)
+
+
 def test_steps_may_become_much_shorter_where_the_terms_of_a_constraint_vanish():
     """A pendulum at its turning point: `q · v` is zero to roundoff of the speeds before."""
     rod = lambda t, y, args: (jnp.sum(y[0] ** 2) - 1, y[0] @ y[1])  # noqa: E731
