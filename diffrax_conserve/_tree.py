@@ -43,12 +43,12 @@ def unflatten(vector: Shaped[Array, " n"], like: Any) -> Any:
     """The components of `vector` in the structure, shapes and dtypes of `like`, whose leaves are
     real; see `unravel` for states."""
     leaves, treedef = jtu.tree_flatten(like)
-    out, start = [], 0
-    for leaf in leaves:
-        shape = jnp.shape(leaf)
-        stop = start + math.prod(shape)
-        out.append(vector[start:stop].reshape(shape).astype(jnp.result_type(leaf)))
-        start = stop
+    stops = np.cumsum([math.prod(jnp.shape(leaf)) for leaf in leaves])[:-1]
+    parts = jnp.split(vector, stops)
+    out = [
+        part.reshape(jnp.shape(leaf)).astype(jnp.result_type(leaf))
+        for part, leaf in zip(parts, leaves, strict=True)
+    ]
     return jtu.tree_unflatten(treedef, out)
 
 

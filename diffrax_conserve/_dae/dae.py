@@ -647,7 +647,8 @@ class ConstraintProjection(AbstractProjection):
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
             free = dataclasses.replace(problem, factor=Diagonal(structure.units(sizes)))
             y, info = SimplifiedNewton().solve(free, candidate)
-            return y, problem.report(candidate, y, info.num_iterations, ok=info.ok)
+            length = lax.stop_gradient(metric.norm(y - candidate))
+            return y, dataclasses.replace(info, correction=length)
         if structure.large is not None:
             # Along a ladder of a thousand resistors the voltages underflow.
             problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))

@@ -144,9 +144,9 @@ def forward_elimination(
     pivot_tolerance = (
         roundoff_pivot_tolerance(gram.dtype) if pivot_tolerance is None else pivot_tolerance
     )
-    matrix = [[gram[i, j] for j in range(m)] for i in range(m)]
-    size = [jnp.abs(gram[k, k]) for k in range(m)]
-    rhs, reduced_rows, order = list(b), list(rows), []
+    matrix = [[*jnp.unstack(row)] for row in jnp.unstack(gram)]
+    size = [jnp.abs(matrix[k][k]) for k in range(m)]
+    rhs, reduced_rows, order = [*jnp.unstack(b)], [*jnp.unstack(rows)], []
     for k in range(m):
         # At `k = 0` all quotients are one, so that nothing is exchanged.
         for i in range(k + 1, m) if k and not presorted else ():
@@ -169,7 +169,7 @@ def permuted(order: PivotOrder, each: Array) -> Array:
     """One element or row for each constraint, in this order."""
     if not order:
         return each
-    x, m = list(each), len(each)
+    x, m = [*jnp.unstack(each)], len(each)
     places = [(k, i) for k in range(1, m) for i in range(k + 1, m)]
     for (k, i), exchanged in zip(places, order, strict=True):
         _exchange(x, k, i, exchanged)

@@ -171,7 +171,7 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
         # In a sum the parts of the state are exact terms, which the gradient shows.
         counted = (x if products or of != _STATE else jnp.zeros_like(x) for x, of in given)
-        sizes = [jnp.abs(x) for x in counted]
+        sizes = [jnp.abs(jax.lax.stop_gradient(x)) for x in counted]
         size = sum(sizes) if name == "sub" else outputs(eqn, *sizes)[0]
         return [(changed(outputs(eqn, *inputs)[0], size), _COMPUTED)]
     if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
