@@ -287,10 +287,15 @@ def _with_frozen_matrix(
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
         y, at_candidate, is_first = now
         level, to_correct, row_scales, rows = each(tested)(y)
+        renewed = is_first | (tests_left <= max_steps + 1 - FROZEN_STEPS)
         tests_left = left_after_test(level, tests_left)
 
+        def anew() -> Any:
+            new = factored(row_scales, rows)
+            return jtu.tree_map(ft.partial(jnp.where, renewed), new, at_candidate)
+
         def move() -> Any:
-            kept = lax.cond(is_first, lambda: factored(row_scales, rows), lambda: at_candidate)
+            kept = lax.cond(any_lane(renewed), anew, lambda: at_candidate)
             row_scales_there, directions, solve = kept
             multiplier = solve(to_correct / row_scales_there)
             change = written_out_product(jnp.moveaxis(directions, 1, 0), multiplier)
@@ -319,21 +324,16 @@ def _with_frozen_jacobian(
     candidate = lax.optimization_barrier(candidate)
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
-    gradients = problem.factor.scale_columns(jacobian)
-    row_scales, rows = gradients.equilibrated()
+    row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
     solve = rows.gram(rows).factorise()
-    _, vjp = jax.vjp(problem.residual, candidate)
-
-    def combination(multiplier: Array) -> Array:
-        """`S Sᵀ Gᵀ λ`. If `G` is sparse, a reverse pass is faster than a sum over indices."""
-        if problem.pattern is not None:
-            return problem.factor.to_state(problem.factor.scale_gradient(vjp(multiplier)[0]))
-        return problem.factor.to_state(gradients.rmatvec(multiplier))
 
     def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
         level, to_correct = problem.level(problem.residual(y), scale)
         tests_left = left_after_test(level, tests_left)
-        move = lambda: y - combination(solve(to_correct / row_scales) / row_scales)  # noqa: E731
+
+        def move() -> Array:
+            return y - problem.factor.to_state(rows.rmatvec(solve(to_correct / row_scales)))
+
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
         return where_active(tests_left, moved, y), tests_left
 
