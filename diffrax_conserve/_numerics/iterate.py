@@ -43,6 +43,7 @@ from .._constants import (
 )
 from .._fast.scalars import components, scalarised, with_lanes_last
 from .linear import (
+    diagonal_shift,
     forward_elimination,
     gram_inverse,
     permuted,
@@ -267,8 +268,14 @@ def _with_frozen_matrix(
     each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
 ) -> Solved:
     """For up to `MAX_BLOCK` constraints: the matrix is that at the candidate, factored once, in the
-    first step. The Jacobian at each state serves for the scales of its residuals alone. It stands
-    at one place in the program, which is what makes this program small.
+    first step. For `FROZEN_STEPS` steps the Jacobian at each state serves for the scales of its
+    residuals alone; after them for the directions and the matrix too. It stands at one place in the
+    program, which is what makes this program small.
+
+    Where constraints depend on each other, their residuals contradict each other by roundoff, so
+    that in general the default is added to the diagonal. It keeps corrections from directions in
+    which gradients differ by less than a millionth, as near a circular orbit. What the first steps
+    have left over may be in such a direction, so after them only roundoff is added.
 
     In a batch the lanes are the last axis of all arrays; see `with_lanes_last`.
     """
@@ -279,10 +286,12 @@ def _with_frozen_matrix(
         row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
         return level, to_correct, row_scales, rows.matrix  # pyright: ignore
 
-    def factored(row_scales: Array, rows: Array) -> Any:
+    def factored(is_first: Array, row_scales: Array, matrix: Array) -> Any:
+        added = jnp.where(is_first, diagonal_shift(matrix), roundoff_pivot_tolerance(matrix.dtype))
         if is_batched:
-            return row_scales, rows, gram_inverse(rows)
-        return row_scales, rows, DenseRows(rows).gram(DenseRows(rows)).factorise()
+            return row_scales, matrix, gram_inverse(matrix, added)
+        rows = DenseRows(matrix)
+        return row_scales, matrix, rows.gram(rows).factorise(pivot_tolerance=added)
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
         y, at_candidate, is_first = now
@@ -291,7 +300,7 @@ def _with_frozen_matrix(
         tests_left = left_after_test(level, tests_left)
 
         def anew() -> Any:
-            new = factored(row_scales, rows)
+            new = factored(is_first, row_scales, rows)
             return jtu.tree_map(ft.partial(jnp.where, renewed), new, at_candidate)
 
         def move() -> Any:
@@ -305,7 +314,7 @@ def _with_frozen_matrix(
         return (where_active(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
 
     candidate = lax.optimization_barrier(candidate)
-    like = jax.eval_shape(lambda y: factored(*each(tested)(y)[2:]), candidate)
+    like = jax.eval_shape(lambda y: factored(jnp.asarray(True), *each(tested)(y)[2:]), candidate)
     at_candidate = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
     begin = candidate, at_candidate, jnp.asarray(True)
     found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])

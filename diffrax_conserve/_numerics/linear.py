@@ -55,13 +55,13 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
 
 
 def diagonal_shift(matrix: Array) -> float:
-    """What is added to the diagonal of a larger Gram matrix, whose elements there are one."""
+    """What is added by default to the diagonal of a larger Gram matrix, whose elements are one."""
     return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
 
 
-def gram_inverse(rows: Float[Array, "m n lanes"]) -> Solve:
+def gram_inverse(rows: Float[Array, "m n lanes"], added: float | Array) -> Solve:
     """`(U Uᵀ)⁻¹ b` as a function of `b`, for the rows `U` of each lane, by Gaussian elimination as
-    in `inverse_factors`.
+    in `inverse_factors`, with `added` to the diagonal, whose elements are one.
 
     What is done with an element is one loop over the lanes, and the steps of the elimination are a
     loop too, so that no kernel repeats the steps before it. The inverses of both factors take the
@@ -77,7 +77,7 @@ def gram_inverse(rows: Float[Array, "m n lanes"]) -> Solve:
     size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
     matrix = (
         matrix / (size[:, None] * size)
-        + diagonal_shift(matrix) * np.eye(m, dtype=rows.dtype)[..., None]
+        + jnp.asarray(added, rows.dtype) * np.eye(m, dtype=rows.dtype)[..., None]
     )
     index = np.arange(m)[:, None]
 

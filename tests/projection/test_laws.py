@@ -165,12 +165,23 @@ def test_leaves_of_different_precision_are_refused():
         project(manifold, y, dfc.SimplifiedNewton(), jnp.array(1.3))
 
 
-def test_the_gradients_at_each_state_lead_to_a_circular_orbit():
-    """It is a curve, which the plane of those at the candidate may miss."""
+@pytest.mark.parametrize("more", [0, 3])
+@pytest.mark.parametrize("away", [1e-3, 1e-7])
+def test_the_gradients_at_each_state_lead_to_a_circular_orbit(more, away):
+    """It is a curve, which the plane of those at the candidate may miss. With `more` constraints
+    beside those of the orbit the elimination is another, and a few in a hundred do not arrive."""
     rng = np.random.default_rng(0)
-    angle, away = rng.uniform(0, 2 * np.pi, 50), 1e-3 * rng.normal(size=(2, 50, 2))
+    angle, away = rng.uniform(0, 2 * np.pi, 50), away * rng.normal(size=(2, 50, 2))
     q = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     v = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    options = dict(value={"energy": -0.5, "momentum": 1.0}, projection=dfc.SimplifiedNewton())
-    ok = jax.jit(jax.vmap(lambda y: dfc.project(KEPLER, y, **options)[1].ok))
-    assert np.all(ok((q + away[0], v + away[1])))
+    ys = q + away[0], v + away[1], 1 + np.tile(away[0, :, :1], more)
+
+    def law(name, value):
+        return dfc.FirstIntegral(lambda t, y, args: KEPLER[name].fn(t, y[:2], args), value=value)
+
+    manifold = {"energy": law("energy", -0.5), "momentum": law("momentum", 1.0)}
+    if more:
+        manifold["squares"] = dfc.FirstIntegral(lambda t, y, args: y[2] ** 2, value=np.ones(more))
+    ok = lambda y: dfc.project(manifold, y, projection=dfc.SimplifiedNewton())[1].ok  # noqa: E731
+    for found in (jax.jit(jax.vmap(ok))(ys), jax.jit(lambda ys: jax.lax.map(ok, ys))(ys)):
+        assert np.mean(found) >= (0.95 if more else 1)
