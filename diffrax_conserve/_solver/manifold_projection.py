@@ -106,9 +106,9 @@ class ManifoldProjection(ForwardingSolver):
     A solve fails at its first step if a function is not finite at the initial state, or if that
     violates a `Constraint` by more than the square root of roundoff, relative to the size of its
     terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise if it
-    continues from the `solver_state` of a solve with other values, and after a jump that the step
-    size controller declares, if the constraint jumps too: end the solve there, `project`, and go
-    on.
+    continues from the `solver_state` of a solve with other values, be it by another state, time,
+    `args` or manifold, and after a jump that the step size controller declares, if the constraint
+    jumps too: end the solve there, `project`, and go on. A balance goes on from the state.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve tries smaller steps until one moves the state by no more than roundoff, or no

@@ -182,10 +182,10 @@ DeepONetSolver.__init__.__doc__ = r"""**Arguments:**
     its `args_domain`. `"count"`: they are counted, for
     [`diffrax_conserve.learned.steps_outside`][], the default; `"fail"`: the solve fails at the
     first; a diffrax solver takes them itself (in a batch of lanes both compute every step).
-- `check_field`: whether to fail if the vector field at the initial state differs from the slope of
-    the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order` at least 1). A
-    learned slope may differ by 75 %, and by more where the field changes much within `max_step`, as
-    in stiff equations.
+- `check_field`: whether to fail if the vector field at the initial state, and at no other, differs
+    from the slope of the flow map for $h \to 0$ by more than 0.1 % if that slope is exact (`order`
+    at least 1). A learned slope may differ by 75 %, and by more where the field changes much within
+    `max_step`, as in stiff equations.
 
 **Raises:**
 
