@@ -300,7 +300,7 @@ MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
     "stack": lambda *xs, axis: np.stack(xs, axis),
     "tile": lambda x, reps: np.tile(x, reps),
     "transpose": lambda x, permutation: x.transpose(permutation),
-    "unstack": lambda x, axis: list(np.moveaxis(x, axis, 0)),
+    "unstack": lambda x, axis: [*map(np.asarray, np.moveaxis(x, axis, 0))],
 }
 # The primitives that move elements by indices. The operands from the first number to before the
 # last are the indices. We can move the places if the indices are known.

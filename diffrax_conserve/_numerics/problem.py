@@ -286,11 +286,10 @@ def problem_of(
     functions = functions_of(manifold, t, like, args)
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
 
-    def converted(fn: Residual, size: int, stop: int) -> Residual:
+    def converted(fn: Residual, value: Array) -> Residual:
         """The residuals of an entry. The user's function may close over arrays, such as the
         parameters of a network. Conversion makes them leaves of the problem: only so can the custom
         rules differentiate by them."""
-        value = values[stop - size : stop]
         return _Converted(eqx.filter_closure_convert(lambda y: fn(y) - value, vector))
 
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
@@ -302,7 +301,7 @@ def problem_of(
         like=like,
         names=entry_names(manifold),
         keys=tuple(key_of(path[0]) if path else None for path, _ in flat),
-        functions=tuple(map(converted, functions, sizes, np.cumsum(sizes))),
+        functions=tuple(map(converted, functions, jnp.split(values, np.cumsum(sizes[:-1])))),
         sizes=tuple(sizes),
         magnitude=lax.stop_gradient(jnp.abs(values) + cancellation),
         cancellation=cancellation,
