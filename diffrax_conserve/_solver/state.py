@@ -95,19 +95,29 @@ class StepEnd(eqx.Module):
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Weighted sums of numbers, and the sums of the absolute terms, to which their roundoff is
-        proportional. `args` may hold many numbers, so their weights are no array in the program:
-        1, 2, 3, ... times one for each leaf."""
+        proportional.
+
+        The numbers in `args` may have any units, such as a constant of 1e-11 and a mass of 1e24, so
+        that what is added is the logarithm of each. There may be many, so their weights are no
+        array in the program.
+        """
         dtype = self.checksums.dtype
-        terms = [[irregular_weights(y.size, dtype) * y], [], [jnp.asarray(t, dtype)]]
         kinds, leaves = (np.number, np.bool_), jtu.tree_leaves((args, manifold))
         numbers = [x for x in leaves if any(jnp.issubdtype(dtype_of(x), kind) for kind in kinds)]
-        for weight, x in zip(irregular_weights(len(numbers), dtype), numbers, strict=True):
-            x = ravel(x) if jnp.iscomplexobj(x) else jnp.ravel(jnp.asarray(x, dtype))
-            terms[1].append(weight * jnp.arange(1, x.size + 1, dtype=dtype) * x.astype(dtype))
-        total = lambda xs: sum((jnp.sum(x) for x in xs), jnp.zeros((), dtype))  # noqa: E731
+        each = [
+            ravel(x) if jnp.iscomplexobj(x) else jnp.ravel(jnp.asarray(x, dtype)) for x in numbers
+        ]
+        x = jnp.concatenate([jnp.zeros(1, dtype), *(x.astype(dtype) for x in each)])
+        tiny = float(jnp.finfo(dtype).tiny)
+        logarithms = jnp.sign(x) * (jnp.log(jnp.maximum(jnp.abs(x), tiny)) - np.log(tiny))
+        terms = (
+            irregular_weights(y.size, dtype) * y,
+            jnp.arange(1, x.size + 1, dtype=dtype) * logarithms,
+            jnp.asarray(t, dtype)[None],
+        )
         terms = lax.stop_gradient(terms)
-        sums = jnp.stack([total(xs) for xs in terms])
-        return sums, jnp.stack([total(map(jnp.abs, xs)) for xs in terms])
+        sums = jnp.stack([jnp.sum(x) for x in terms])
+        return sums, jnp.stack([jnp.sum(jnp.abs(x)) for x in terms])
 
 
 def initial_values(

@@ -120,8 +120,8 @@ def test_a_continued_solve_keeps_the_first_conserved_value_and_refuses_another()
 
 
 def growing(more=0.0):
-    """`|y|² = args (1 + t)`, for the field below."""
-    return dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - args * (1 + t) - more)
+    """`|y|² = args[0] (1 + t)`, for the field below."""
+    return dfc.Constraint(lambda t, y, args: jnp.sum(y**2) - args[0] * (1 + t) - more)
 
 
 @pytest.mark.parametrize(
@@ -139,11 +139,11 @@ def test_what_a_new_solve_refuses_is_refused_by_one_that_goes_on(changed, fits):
     """With the end of the first solve as its start, and one thing changed."""
     law = growing()
 
-    def run(y0, t0=1.0, args=1.0, law=law, **options):
+    def run(y0, t0=1.0, args=1.0, law=law, **options):  # beside a number in other units
         solver = dfc.ManifoldProjection(dfx.Heun(), law)
         options = dict(saveat=dfx.SaveAt(t1=True, solver_state=True), throw=False) | options
         field = lambda t, y, args: y / (2 * (1 + t))  # noqa: E731
-        return solve(field, solver, y0, t0=t0, t1=t0 + 1, args=jnp.asarray(args), **options)
+        return solve(field, solver, y0, t0=t0, t1=t0 + 1, args=(args, 1e30), **options)
 
     first = run(jnp.array([1.0, 0.0]), t0=0.0)
     new, on = (run(first.ys[-1], **changed, solver_state=x) for x in (None, first.solver_state))
