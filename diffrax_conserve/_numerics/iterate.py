@@ -11,7 +11,8 @@ is called a step of the solver.
   gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
-  last state, so that the iteration is Newton's method; for more it is evaluated at the candidate.
+  last state, so that the iteration is Newton's method; for more it is evaluated at the candidate,
+  and for up to sixteen, if a few steps are not enough, at the states after them.
 - `semismooth_newton` keeps a state within bounds, along given directions, with a line search.
 - `damped_newton` is for starts far away. Without given directions each step is the shortest, in the
   metric, that solves the equations linearised at the last state (P. Deuflhard, *Newton Methods for
@@ -191,8 +192,8 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
-    For up to four constraints they are `directions` if these are given, and otherwise, after
-    `FROZEN_STEPS` iterations, the gradients at the current state."""
+    For up to four constraints they are `directions` if these are given. Otherwise, and for up to
+    `MAX_BLOCK`, they are after `FROZEN_STEPS` iterations the gradients at the current state."""
     assert directions is None or problem.magnitude.size <= MAX_UNROLLED
     if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
@@ -294,23 +295,24 @@ def _with_frozen_matrix(
         return row_scales, matrix, rows.gram(rows).factorise(pivot_tolerance=added)
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        y, at_candidate, is_first = now
+        y, last, is_first = now
         level, to_correct, row_scales, rows = each(tested)(y)
-        renewed = is_first | (tests_left <= max_steps + 1 - FROZEN_STEPS)
+        is_late = tests_left <= max_steps + 1 - FROZEN_STEPS
         tests_left = left_after_test(level, tests_left)
+        renewed = is_first | (is_late & (tests_left > 0))
 
         def anew() -> Any:
             new = factored(is_first, row_scales, rows)
-            return jtu.tree_map(ft.partial(jnp.where, renewed), new, at_candidate)
+            return jtu.tree_map(ft.partial(jnp.where, renewed), new, last)
 
         def move() -> Any:
-            kept = lax.cond(any_lane(renewed), anew, lambda: at_candidate)
+            kept = lax.cond(any_lane(renewed), anew, lambda: last)
             row_scales_there, directions, solve = kept
             multiplier = solve(to_correct / row_scales_there)
             change = written_out_product(jnp.moveaxis(directions, 1, 0), multiplier)
             return y - each(lambda problem, x: problem.factor.to_state(x))(change), kept
 
-        moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, at_candidate))
+        moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, last))
         return (where_active(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
 
     candidate = lax.optimization_barrier(candidate)
