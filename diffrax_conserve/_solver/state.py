@@ -1,6 +1,7 @@
 """The solver state of a `ManifoldProjection`, and how each solver that keeps a manifold starts."""
 
 import dataclasses
+import math
 from typing import Any
 
 import equinox as eqx
@@ -109,7 +110,7 @@ class StepEnd(eqx.Module):
         ]
         x = jnp.concatenate([jnp.zeros(1, dtype), *(x.astype(dtype) for x in each)])
         tiny = float(jnp.finfo(dtype).tiny)
-        logarithms = jnp.sign(x) * (jnp.log(jnp.maximum(jnp.abs(x), tiny)) - np.log(tiny))
+        logarithms = jnp.sign(x) * (jnp.log(jnp.maximum(jnp.abs(x), tiny)) - math.log(tiny))
         terms = (
             irregular_weights(y.size, dtype) * y,
             jnp.arange(1, x.size + 1, dtype=dtype) * logarithms,
