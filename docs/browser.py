@@ -38,7 +38,9 @@ async whole => {
 
 # The theme's script lays out a page after it has loaded, at a moment that nothing announces: what
 # it mends within these looks, a tenth of a second apart, is no problem.
-LOOKS = 50
+LOOKS = 300
+# In milliseconds, on a machine that does other work beside it.
+TIMEOUT = 120_000
 
 
 def problems(site: Path, chromium: str) -> list[str]:
@@ -59,6 +61,7 @@ def problems(site: Path, chromium: str) -> list[str]:
         # Without a sandbox, which a container does not allow; the pages are our own.
         browser = playwright.chromium.launch(executable_path=chromium, chromium_sandbox=False)
         page = browser.new_page()
+        page.set_default_timeout(TIMEOUT)
         page.route("**/*", serve)
         page.on("console", lambda message: found.append(f"{page.url} says {message.text}"))
         page.on("pageerror", lambda error: found.append(f"{page.url} says {error}"))
