@@ -67,7 +67,7 @@ def assert_near(got, expected):
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-@settings(max_examples=16)
+@settings(max_examples=10)
 @given(st.lists(STEP, min_size=1, max_size=5), st.sampled_from([in_full, folded]))
 def test_a_small_program_is_the_function_with_its_derivatives(steps, in_full):
     """In both modes, of second order, in a batch, and once more written out."""

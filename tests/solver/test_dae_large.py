@@ -163,7 +163,9 @@ def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monke
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(("make", "n"), [(pairs, 60), (chain, 24)])
+@pytest.mark.parametrize(
+    ("make", "n"), [(pairs, 60), pytest.param(chain, 24, marks=pytest.mark.slow)]
+)
 def test_consistent_states_of_a_higher_index_are_those_of_dense_matrices(make, n, monkeypatch):
     """With 120 unknowns, index 2 and 3; and inside of another program."""
 
