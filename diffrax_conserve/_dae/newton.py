@@ -141,7 +141,8 @@ def algebraic_newton(
         g, jacobian, hidden = cancellation_terms(residual, z)
         limit = ROUNDOFF * eps_of(z)
         scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
-        return jnp.all(jnp.abs(g) <= limit * scale)
+        # The square of a term may be infinite, and then so is the scale.
+        return jnp.all((jnp.abs(g) <= limit * scale) & (scale < jnp.inf))
 
     unsure = at_rest & ~converged
     found = at_rest & (
@@ -168,8 +169,9 @@ def at_rest_near(
     linearised = _Factored.at if sparse is None else sparse.at
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        # The unknowns, the share of the correction to try next, and whether they have converged.
-        z, share, _ = now
+        # The unknowns, the share of the correction to try next, whether all larger shares have been
+        # tried at these unknowns, and whether they have converged.
+        z, share, from_one, _ = now
         factored = linearised(residual, z)
         step = factored.correction(residual(z))
         trial = z + share * step
@@ -186,19 +188,21 @@ def at_rest_near(
         # The later corrections shrink at least by the same ratio, `then / before`. So the one that
         # would follow both is at most `then² / before`, which is roundoff here.
         converged = better & (share == 1) & (then * then <= eps * before)
-        # If a correction of at most `√ε` does not help, it is probably roundoff that keeps it from
-        # helping.
-        stuck = ~better & (before <= eps**0.5)
-        # A share of the root of roundoff still changes half of the digits of the unknown.
-        going = ~stuck & (before < jnp.inf) & (better | (share * BACKTRACKING_FACTOR > eps**0.5))
+        # If a change of at most `√ε` does not help, it is probably roundoff that keeps it from
+        # helping. From a poor guess it may be a tiny share of the correction, which for a diode at
+        # rest is longer than the voltage by the ratio of the currents; and that share may be too
+        # small for the next correction.
+        too_short = share * BACKTRACKING_FACTOR * before <= eps**0.5
+        going = (before < jnp.inf) & (better | ~too_short | ~from_one)
         z = jnp.where(better, trial, z) + jnp.where(converged, after, 0)
         longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
-        share = jnp.where(better, longer, shorter)
+        share = jnp.where(better, longer, jnp.where(too_short, 1, shorter))
+        from_one = (share == 1) | (from_one & ~better)
         at_rest = (converged | (~going & (before < jnp.inf))) & factored.regular()
-        return where_active(tests_left, (z, share, converged), now), left_after_step(
+        return where_active(tests_left, (z, share, from_one, converged), now), left_after_step(
             at_rest, going, tests_left
         )
 
-    start = z, jnp.ones((), z.dtype), jnp.asarray(False)
-    (z, _, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
+    start = z, jnp.ones((), z.dtype), jnp.asarray(True), jnp.asarray(False)
+    (z, *_, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
     return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, converged)

@@ -150,6 +150,25 @@ def test_newton_finds_the_voltage_at_a_diode():
     assert largest(off / (scale + 1e-6)) < 4 * EPS
 
 
+SOURCE = pair(lambda t, x, z, a: 0 * x, lambda t, x, z, a: x - a * jnp.expm1(z / 0.025))
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_diode_at_rest_is_a_guess_for_every_current(dtype):
+    """There a correction is longer than the voltage by the ratio of both currents."""
+    current, least, guess = map(np.ravel, np.meshgrid([1e-3, 1, 30], [1e-6, 1e-9, 1e-14], [0, 0.4]))
+    given = (x.astype(dtype) for x in (current, guess, least))
+    _, z = jax.jit(jax.vmap(lambda x, z, a: SOURCE.consistent(x, z, args=a)))(*given)
+    assert largest(z / (0.025 * np.log1p(current / least)) - 1) < 4 * np.finfo(dtype).eps
+
+
+def test_a_residual_in_any_unit_is_no_root():
+    """Where it changes its sign by a jump, also if the squares of its terms overflow."""
+    dae = pair(lambda t, x, z, a: 0 * x, lambda t, x, z, a: a * (jnp.sign(z - x) + z - x))
+    find = jax.jit(lambda a: dae.consistent(jnp.array(1.0), jnp.array(1.5), args=a)[1])
+    assert all(jnp.isnan(find(a)) for a in (1.0, 1e-160, 1e160))
+
+
 def test_an_unknown_that_is_zero():
     """There the roundoff of the constants inside `g` is larger than all terms that its gradient
     shows."""

@@ -66,6 +66,22 @@ def test_by_default_steps_outside_are_counted_and_the_first_time_is_known():
     assert dfc.learned.steps_outside(solve(solver, t1=1.0, saveat=STATE)).first_time == jnp.inf
 
 
+def test_a_step_by_hand_keeps_its_time_and_fails_backwards():
+    """From times that are numbers, which have no dtype of their own."""
+    solver = unchecked(KNOWS)
+
+    @jax.jit
+    def stepped(end):
+        state = solver.init(TERM, 1e6, 1e6 + 0.5, -EAST, None)
+        return solver.step(TERM, 1e6, end, -EAST, None, state, False)[-2:]
+
+    for h, word in ((0.5, ""), (-0.5, "backwards")):
+        (_, counted), result = stepped(1e6 + h)
+        assert (counted.number, counted.first_time) == (1, 1e6)
+        assert word in dfx.RESULTS[result]
+        assert bool(result == dfx.RESULTS.successful) is (h > 0)
+
+
 @pytest.mark.slow
 def test_rejected_steps_do_not_count():
     solver = unchecked(KNOWS, corrections=1)

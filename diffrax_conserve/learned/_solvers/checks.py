@@ -116,6 +116,7 @@ def with_result(
     slack = 1e-6 * max_step + 8 * jnp.finfo(h.dtype).eps * jnp.abs(t1)
     failed = jnp.where(tree_all_finite(step.y1), 0, _NOT_FINITE)
     failed = jnp.where(h <= max_step + slack, failed, _TOO_LONG)
+    failed = jnp.where(h >= 0, failed, _BACKWARDS)  # in steps by hand
     ended = refused > 0
 
     def error(e: Array) -> Array:

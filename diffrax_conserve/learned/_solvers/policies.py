@@ -8,7 +8,6 @@ import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from ..._custom_types import BoolScalarLike, RealScalarLike, Y
@@ -31,7 +30,7 @@ class StepsOutside(NamedTuple):
 
     @classmethod
     def zero(cls, t0: RealScalarLike) -> "StepsOutside":
-        return cls(jnp.asarray(0), jnp.full((), jnp.inf, jnp.result_type(t0, np.float16)))
+        return cls(jnp.asarray(0), jnp.full((), jnp.inf, jnp.result_type(t0, float)))
 
     def add(self, t0: RealScalarLike, trusted: BoolScalarLike) -> "StepsOutside":
         time = jnp.where(trusted, jnp.inf, t0).astype(self.first_time.dtype)
