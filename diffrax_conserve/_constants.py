@@ -26,6 +26,10 @@ BACKTRACKING_FACTOR = 1 / 4
 # Up to this many constraints the elimination is written out, element by element, so that XLA fuses
 # it with what is around it. A call of LAPACK would take most of the time of a small projection.
 MAX_UNROLLED = 4
+# Up to this many constraints a batch of nearby projections is written out in scalars. From three on
+# its kernels repeat the elimination: a step with four took 43 steps of plain RK4 in a batch of 64,
+# and 15 with the lanes as the last axis (`benchmarks/cost/few_constraints.py`).
+MAX_IN_SCALARS = 2
 # This power of roundoff, times the root of the number of constraints, is added to the diagonal of
 # larger matrices, as a share of it, so that they can be factored where constraints depend on each
 # other. The residuals of such constraints contradict each other by roundoff, which becomes an error

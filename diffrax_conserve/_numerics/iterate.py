@@ -38,6 +38,7 @@ from .._constants import (
     BACKTRACKING_FACTOR,
     FROZEN_STEPS,
     MAX_BLOCK,
+    MAX_IN_SCALARS,
     MAX_UNROLLED,
     ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
@@ -45,9 +46,8 @@ from .._constants import (
 from .._fast.scalars import components, scalarised, with_lanes_last
 from .linear import (
     diagonal_shift,
-    forward_elimination,
     gram_inverse,
-    permuted,
+    gram_solution,
     roundoff_pivot_tolerance,
     written_out_product,
 )
@@ -192,13 +192,13 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
-    For up to four constraints they are `directions` if these are given. Otherwise, and for up to
+    For one or two constraints they are `directions` if these are given. Otherwise, and for up to
     `MAX_BLOCK`, they are after `FROZEN_STEPS` iterations the gradients at the current state."""
-    assert directions is None or problem.magnitude.size <= MAX_UNROLLED
+    assert directions is None or problem.magnitude.size <= MAX_IN_SCALARS
     if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
-    if problem.magnitude.size > MAX_UNROLLED:
-        run = ft.partial(_with_frozen_matrix, max_steps=max_steps)
+    if problem.magnitude.size > MAX_IN_SCALARS:
+        run = ft.partial(_with_lanes_last, max_steps=max_steps)
         return with_lanes_last(run, problem, candidate)
     run = ft.partial(_with_fresh_jacobians, max_steps=max_steps)
     return with_batch_flag(run, (problem, candidate, directions))
@@ -209,43 +209,27 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
     problem, candidate, directions = given
     dtype = problem.magnitude.dtype
-    roundoff = roundoff_pivot_tolerance(dtype)
 
     def loop_invariants(y: Any) -> Any:
-        """The order in which all steps eliminate the constraints, and in this order the given
-        directions, or the gradients at the candidate."""
-        rows = problem.gradients(y).equilibrated()[1]
-        fixed = rows if directions is None else directions
-        gram = rows.gram(fixed).matrix
-        order = forward_elimination(gram, gram[0], gram)[2]
-        return order, permuted(order, fixed.matrix)
+        """The given directions, or the gradients at the candidate."""
+        rows = problem.gradients(y).equilibrated()[1] if directions is None else directions
+        return rows.matrix  # pyright: ignore
 
-    def advance(invariants: Any, y: Any, tests_left: Array) -> tuple[Any, Array]:
-        order, fixed = invariants
+    def advance(fixed: Any, y: Any, tests_left: Array) -> tuple[Any, Array]:
         linearised = problem.linearise(y)
         # Without a barrier XLA would evaluate the residuals once for each use of them.
         g, jacobian = linearised if is_batched else lax.optimization_barrier(linearised)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
         row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
-        rows, to_correct = permuted(order, rows.matrix), permuted(order, to_correct / row_scales)
         may_switch = directions is None and max_steps > FROZEN_STEPS
         # We count by the number before `left_after_test`, which may set it to two for a step that
         # polishes. If that step leaves the tolerance, the next one is along the current gradients.
         frozen = tests_left > max_steps + 1 - FROZEN_STEPS
-        current = jnp.where(frozen, fixed, rows) if may_switch else fixed
+        current = DenseRows(jnp.where(frozen, fixed, rows.matrix) if may_switch else fixed)  # pyright: ignore
         tests_left = left_after_test(level, tests_left)
-        # A step that only polishes is as long as roundoff divided by the sine of the angle between
-        # gradients. So that it is at most `ROUNDOFF` times as long as with a right angle,
-        # constraints with a sine of at most `1 / ROUNDOFF` take no part in it. In float64 it is
-        # short in any case, and a batch is faster without the distinction.
-        pivot_tolerance = None
-        if dtype != jnp.float64:
-            pivot_tolerance = jnp.where(
-                level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2)
-            )
-        rows, current = DenseRows(rows), DenseRows(current)
+        pivot_tolerance = _pivot_tolerance(level, dtype)
         change = rows.gram(current).row_space_correction(
-            current, to_correct, pivot_tolerance=pivot_tolerance, presorted=True
+            current, to_correct / row_scales, pivot_tolerance=pivot_tolerance
         )
         newton_point = y - problem.factor.to_state(change)
         return where_active(tests_left, newton_point, y), tests_left
@@ -265,61 +249,86 @@ def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> So
     return iterate(ft.partial(advance, loop_invariants(y)), y, max_steps=max_steps)
 
 
-def _with_frozen_matrix(
+def _pivot_tolerance(level: Array, dtype: Any) -> float | Array:
+    """A step that only polishes is as long as roundoff divided by the sine of the angle between
+    gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, constraints
+    with a sine of at most `1 / ROUNDOFF` take no part in it. In float64 it is short in any case,
+    and a batch is faster without the distinction."""
+    roundoff = roundoff_pivot_tolerance(dtype)
+    if dtype == jnp.float64:
+        return roundoff
+    return jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
+
+
+def _with_lanes_last(
     each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
 ) -> Solved:
-    """For up to `MAX_BLOCK` constraints: the matrix is that at the candidate, factored once, in the
-    first step. For `FROZEN_STEPS` steps the Jacobian at each state serves for the scales of its
-    residuals alone; after them for the directions and the matrix too. It stands at one place in the
-    program, which is what makes this program small.
+    """For up to `MAX_BLOCK` constraints. In a batch the lanes are the last axis of all arrays; see
+    `with_lanes_last`. The Jacobian stands at one place in the program, which makes it small.
 
-    Where constraints depend on each other, their residuals contradict each other by roundoff, so
-    that in general the default is added to the diagonal. It keeps corrections from directions in
-    which gradients differ by less than a millionth, as near a circular orbit. What the first steps
-    have left over may be in such a direction, so after them only roundoff is added.
+    Up to `MAX_UNROLLED` constraints have a matrix of each state. Pivots that are roundoff count as
+    infinite: if the other constraints hold, these hold too.
 
-    In a batch the lanes are the last axis of all arrays; see `with_lanes_last`.
+    For more the matrix is that at the candidate, factored once, in the first step. For
+    `FROZEN_STEPS` steps the Jacobian at each state serves for the scales of its residuals alone;
+    after them for the directions and the matrix too. Where constraints depend on each other, their
+    residuals contradict each other by roundoff, so that in general the default is added to the
+    diagonal. It keeps corrections from directions in which gradients differ by less than a
+    millionth, as near a circular orbit. What the first steps have left over may be in such a
+    direction, so after them only roundoff is added.
     """
 
     def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
         g, jacobian = problem.linearise(y)
         level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
-        return level, to_correct, row_scales, rows.matrix  # pyright: ignore
-
-    def factored(is_first: Array, row_scales: Array, matrix: Array) -> Any:
-        added = jnp.where(is_first, diagonal_shift(matrix), roundoff_pivot_tolerance(matrix.dtype))
-        if is_batched:
-            return row_scales, matrix, gram_inverse(matrix, added)
-        rows = DenseRows(matrix)
-        return row_scales, matrix, rows.gram(rows).factorise(pivot_tolerance=added)
+        return level, to_correct, problem.factor.scale_columns(jacobian).matrix  # pyright: ignore
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        y, last, is_first = now
-        level, to_correct, row_scales, rows = each(tested)(y)
-        is_late = tests_left <= max_steps + 1 - FROZEN_STEPS
+        y, *last = now
+        level, to_correct, rows = each(tested)(y)
+        is_first, is_late = tests_left > max_steps, tests_left <= max_steps + 1 - FROZEN_STEPS
         tests_left = left_after_test(level, tests_left)
         renewed = is_first | (is_late & (tests_left > 0))
+        roundoff, in_general = roundoff_pivot_tolerance(rows.dtype), diagonal_shift(rows)
 
-        def anew() -> Any:
-            new = factored(is_first, row_scales, rows)
-            return jtu.tree_map(ft.partial(jnp.where, renewed), new, last)
+        def factored(rows: Array, directions: Array) -> tuple[Array, ...]:
+            left, right = (DenseRows(x).equilibrated()[1].matrix for x in (rows, directions))
+            if not keeps_matrix:
+                least = _pivot_tolerance(level, rows.dtype)
+                return gram_inverse(left, right, pivot_tolerance=least, ordered=True)
+            return gram_inverse(left, right, added=jnp.where(is_late, roundoff, in_general))[:1]
 
-        def move() -> Any:
-            kept = lax.cond(any_lane(renewed), anew, lambda: last)
-            row_scales_there, directions, solve = kept
-            multiplier = solve(to_correct / row_scales_there)
-            change = written_out_product(jnp.moveaxis(directions, 1, 0), multiplier)
-            return y - each(lambda problem, x: problem.factor.to_state(x))(change), kept
+        def anew() -> list[Array]:
+            new = [rows, *factored(rows, rows)]
+            return [jnp.where(renewed, a, b) for a, b in zip(new, last, strict=True)]
 
-        moved, kept = lax.cond(any_lane(tests_left > 0), move, lambda: (y, last))
-        return (where_active(tests_left, moved, y), kept, jnp.asarray(False)), tests_left
+        def move() -> list[Array]:
+            if keeps_matrix:
+                kept = lax.cond(any_lane(renewed), anew, lambda: last)
+                of_matrix, factors = kept
+                place = np.arange(m).reshape(m, *[1] * len(lanes))
+            else:
+                kept, of_matrix = [jnp.where(renewed, rows, *last)], rows
+                factors, place = factored(rows, *kept)
+            row_scales, _ = DenseRows(of_matrix).equilibrated()
+            _, directions = DenseRows(kept[0]).equilibrated()
+            multiplier = gram_solution(factors, place, to_correct / row_scales)
+            change = written_out_product(jnp.moveaxis(directions.matrix, 1, 0), multiplier)
+            return [y - each(lambda problem, x: problem.factor.to_state(x))(change), *kept]
+
+        # Alone, for a few constraints, a branch takes longer than what it avoids.
+        branch = is_batched or keeps_matrix
+        moved, *kept = lax.cond(any_lane(tests_left > 0), move, lambda: now) if branch else move()
+        return [where_active(tests_left, moved, y), *kept], tests_left
 
     candidate = lax.optimization_barrier(candidate)
-    like = jax.eval_shape(lambda y: factored(jnp.asarray(True), *each(tested)(y)[2:]), candidate)
-    at_candidate = jtu.tree_map(lambda x: jnp.zeros(x.shape, x.dtype), like)
-    begin = candidate, at_candidate, jnp.asarray(True)
-    found = iterate(advance, begin, max_steps=max_steps, lanes=candidate.shape[1:])
+    n, *lanes = candidate.shape
+    m = jax.eval_shape(each(tested), candidate)[1].shape[0]
+    keeps_matrix = m > MAX_UNROLLED
+    begin = [candidate, jnp.zeros((m, n, *lanes), candidate.dtype)]
+    if keeps_matrix:
+        begin.append(jnp.zeros((m, m, *lanes), np.promote_types(candidate.dtype, np.float32)))
+    found = iterate(advance, begin, max_steps=max_steps, lanes=tuple(lanes))
     return found._replace(y=found.y[0])
 
 

@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import MAX_WRITTEN_OUT, NUM_REFINEMENTS, REGULARISATION_POWER, ROUNDOFF
 from .._tree import eps_of
@@ -59,48 +59,81 @@ def diagonal_shift(matrix: Array) -> float:
     return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
 
 
-def gram_inverse(rows: Float[Array, "m n lanes"], added: float | Array) -> Solve:
-    """`(U Uᵀ)⁻¹ b` as a function of `b`, for the rows `U` of each lane, by Gaussian elimination as
-    in `inverse_factors`, with `added` to the diagonal, whose elements are one.
+def gram_inverse(
+    rows: Float[Array, "m n *lanes"],
+    others: Float[Array, "m n *lanes"],
+    *,
+    added: float | Array = 0.0,
+    pivot_tolerance: float | Array = 0.0,
+    ordered: bool = False,
+) -> tuple[Float[Array, "m m *lanes"], Int[Array, "m *lanes"]]:
+    """The factors of `U Vᵀ` for `gram_solution`, for the rows alone or of each lane, by Gaussian
+    elimination as in `inverse_factors`, and the place of each row in the order of elimination. If
+    `ordered`, that is the order of `forward_elimination`, and otherwise the given one.
+
+    To each element of the diagonal its share `added` is added, and a pivot of at most its share
+    `pivot_tolerance` counts as infinite. The pivots are on the diagonal of the result, and the
+    inverses of both factors take the places of the elements that were eliminated (Gauss and
+    Jordan). So no rows are exchanged: those that are left are told by their place.
 
     What is done with an element is one loop over the lanes, and the steps of the elimination are a
-    loop too, so that no kernel repeats the steps before it. The inverses of both factors take the
-    places of the elements that were eliminated (Gauss and Jordan).
+    loop too, so that no kernel repeats the steps before it.
     """
-    m, n, _ = rows.shape
-    rows = rows.astype(np.promote_types(rows.dtype, np.float32))
+    m, n, *lanes = rows.shape
+    dtype = np.promote_types(rows.dtype, np.float32)
+    rows, others = rows.astype(dtype), others.astype(dtype)
     if n > MAX_WRITTEN_OUT:
-        matrix = jnp.einsum("ikl,jkl->ijl", rows, rows, precision=lax.Precision.HIGHEST)
+        matrix = jnp.einsum("ik...,jk...->ij...", rows, others, precision=lax.Precision.HIGHEST)
+    elif not lanes:
+        matrix = jnp.sum(rows[:, None] * others, axis=2)
     else:
-        matrix = ft.reduce(op.add, (x[:, None] * x for x in jnp.unstack(rows, axis=1)))
-    diagonal = jnp.stack([matrix[k, k] for k in range(m)])
-    size = jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1))
-    matrix = (
-        matrix / (size[:, None] * size)
-        + jnp.asarray(added, rows.dtype) * np.eye(m, dtype=rows.dtype)[..., None]
-    )
-    index = np.arange(m)[:, None]
+        pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(others, axis=1), strict=True)
+        matrix = ft.reduce(op.add, (x[:, None] * y for x, y in pairs))
+    i, j = _indices(m, lanes)
+    matrix = jnp.where(i == j, matrix + jnp.asarray(added, dtype) * matrix, matrix)
+    size = jnp.abs(_diagonal(matrix))
+    infinite = lambda pivot, k: jnp.where(jnp.abs(pivot) <= pivot_tolerance * k, jnp.inf, pivot)  # noqa: E731
 
-    def eliminate(k: Array, matrix: Array) -> Array:
-        row, column = matrix[k], matrix[:, k]
-        is_k = index == k
-        row, column = jnp.where(is_k, 1, row) / row[k], jnp.where(is_k, 1, column)
-        crossing = (is_k | is_k.T)[..., None]
-        rest = jnp.where(crossing, 0, matrix) - column[:, None] * row
-        return jnp.where((jnp.maximum(index, index.T) > k)[..., None], rest, matrix)
+    def eliminate(k: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        matrix, place = now
+        share = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
+        next_one = jnp.argmax(jnp.where(place == m, share, -1), axis=0) if ordered else k
+        is_k = j == next_one
+        row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0) if ordered else matrix[k]
+        column = jnp.sum(jnp.where(is_k, matrix, 0), axis=1) if ordered else matrix[:, k]
+        pivot = jnp.sum(jnp.where(is_k, row, 0), axis=0)
+        pivot = infinite(pivot, jnp.sum(jnp.where(is_k, size, 0), axis=0))
+        place = jnp.where(is_k, k, place)
+        row, column = jnp.where(is_k, 1, row) / pivot, jnp.where(is_k, 1, column)
+        rest = jnp.where(is_k[:, None] | is_k, 0, matrix) - column[:, None] * row
+        left = place == m
+        return jnp.where(left[:, None] | left, rest, matrix), place
 
-    matrix = lax.fori_loop(0, m - 1, eliminate, matrix)
-    pivots = jnp.stack([matrix[k, k] for k in range(m)])
-    left = jnp.where((index > index.T)[..., None], matrix, 0)
-    right = jnp.where((index < index.T)[..., None], matrix, 0)
-    return jtu.Partial(_solution_of_lanes, left, right, pivots, size)
+    begin = matrix, jnp.full((m, *lanes), m)
+    matrix, place = lax.fori_loop(0, m - 1, eliminate, begin)
+    return jnp.where(i == j, infinite(matrix, size), matrix), place
 
 
-def _solution_of_lanes(left: Array, right: Array, pivots: Array, size: Array, b: Array) -> Array:
+def _diagonal(matrix: Array) -> Array:
+    return jnp.stack([matrix[k, k] for k in range(len(matrix))])
+
+
+def gram_solution(
+    factors: Float[Array, "m m *lanes"], place: Array, b: Float[Array, "m *lanes"]
+) -> Array:
+    """`(U Vᵀ)⁻¹ b`, by what `gram_inverse` returns."""
+    later, earlier = place[:, None] > place, place[:, None] < place
+    pivots = _diagonal(factors)
     # XLA does not repeat a quotient in each kernel that uses it, as it does with a product.
-    x = b.astype(size.dtype) / size
-    x = (x + written_out_product(left, x)) / pivots
-    return ((x + written_out_product(right, x)) / size).astype(b.dtype)
+    x = b.astype(factors.dtype)
+    x = (x + written_out_product(jnp.where(later, factors, 0), x)) / pivots
+    return (x + written_out_product(jnp.where(earlier, factors, 0), x)).astype(b.dtype)
+
+
+def _indices(m: int, lanes: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Of the row, and of the column, which is that of an element of a vector."""
+    column = np.arange(m).reshape(m, *[1] * len(lanes))
+    return column[:, None], column
 
 
 def written_out_product(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
@@ -119,39 +152,33 @@ def iterative_refinement(
     return x
 
 
-# One flag for each comparison of pivots `(k, i)`, `1 ≤ k < i`: whether these rows are exchanged.
-PivotOrder = tuple[Bool[Array, ""], ...]
-
-
 def forward_elimination(
     gram: Float[Array, "m m"],
     b: Array,
     rows: Array,
     *,
     pivot_tolerance: float | Array | None = None,
-    presorted: bool = False,
-) -> tuple[Array, Array, PivotOrder]:
-    """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination, and the
-    order of the pivots. The transpose of the first times the second is `rowsᵀ gram⁻¹ b`.
+) -> tuple[Array, Array]:
+    """`R⁻ᵀ rows` and `L⁻¹ b` for a small matrix `gram = L R`, by Gaussian elimination. The
+    transpose of the first times the second is `rowsᵀ gram⁻¹ b`.
 
     Divided by the element on the diagonal of `gram`, the pivot of a constraint is the squared sine
     of the angle between its gradient and the span of the gradients before it. The next constraint
     is that with the largest: if a nearly parallel gradient came earlier, its roundoff would be
-    magnified in the pivots of those that could replace it. The arguments may be `presorted` in this
-    way already. A pivot of at most `pivot_tolerance` times the element on the diagonal, by default
-    roundoff, counts as infinite, so that its multiplier is zero."""
+    magnified in the pivots of those that could replace it. A pivot of at most `pivot_tolerance`
+    times the element on the diagonal, by default roundoff, counts as infinite, so that its
+    multiplier is zero."""
     m = len(gram)
     pivot_tolerance = (
         roundoff_pivot_tolerance(gram.dtype) if pivot_tolerance is None else pivot_tolerance
     )
     matrix = [[*jnp.unstack(row)] for row in jnp.unstack(gram)]
     size = [jnp.abs(matrix[k][k]) for k in range(m)]
-    rhs, reduced_rows, order = [*jnp.unstack(b)], [*jnp.unstack(rows)], []
+    rhs, reduced_rows = [*jnp.unstack(b)], [*jnp.unstack(rows)]
     for k in range(m):
         # At `k = 0` all quotients are one, so that nothing is exchanged.
-        for i in range(k + 1, m) if k and not presorted else ():
+        for i in range(k + 1, m) if k else ():
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
-            order.append(larger)
             for each in (*matrix[k:], matrix, size, rhs, reduced_rows):
                 _exchange(each, k, i, larger)
         pivot = jnp.where(jnp.abs(matrix[k][k]) > pivot_tolerance * size[k], matrix[k][k], jnp.inf)
@@ -162,18 +189,7 @@ def forward_elimination(
             for j in range(k + 1, m):
                 matrix[i][j] = matrix[i][j] - lower * matrix[k][j]
         rhs[k] = rhs[k] / pivot
-    return jnp.stack(reduced_rows), jnp.stack(rhs), tuple(order)
-
-
-def permuted(order: PivotOrder, each: Array) -> Array:
-    """One element or row for each constraint, in this order."""
-    if not order:
-        return each
-    x, m = [*jnp.unstack(each)], len(each)
-    places = [(k, i) for k in range(1, m) for i in range(k + 1, m)]
-    for (k, i), exchanged in zip(places, order, strict=True):
-        _exchange(x, k, i, exchanged)
-    return jnp.stack(x)
+    return jnp.stack(reduced_rows), jnp.stack(rhs)
 
 
 def _exchange(x: list[Any], k: int, i: int, exchanged: Bool[Array, ""]) -> None:

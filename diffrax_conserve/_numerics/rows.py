@@ -96,9 +96,9 @@ class AbstractRows(eqx.Module):
         The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
         they do not in usual units, so there the scales are one, which saves time.
         """
-        if self.dtype == jnp.float64:
-            return jnp.ones(len(self)), self
         row_scales = self.largest()
+        if self.dtype == jnp.float64:
+            return jnp.ones_like(row_scales), self
         row_scales = jnp.where(row_scales > 0, row_scales, 1)
         return row_scales, self.divide_rows(row_scales)
 
@@ -150,11 +150,9 @@ class AbstractGram(eqx.Module):
         b: Float[Array, " m"],
         *,
         pivot_tolerance: float | Array | None = None,
-        presorted: bool = False,
     ) -> Float[Array, " n"]:
         """`Vᵀ (U Vᵀ)⁻¹ b`, the combination of the rows `V` that changes `U x` by `b`.
-        `directions`: the rows `V`. `presorted`: see `forward_elimination`."""
-        del presorted
+        `directions`: the rows `V`."""
         return directions.rmatvec(self.solve(b, pivot_tolerance=pivot_tolerance))
 
 
@@ -219,7 +217,7 @@ class PivotedGram(_DenseGram):
         del pivot_tolerance
         matrix, equilibration = _equilibrated(self.matrix)
         one = jnp.eye(len(matrix), dtype=matrix.dtype)
-        inverse_upper_t, inverse_lower, _ = forward_elimination(matrix, one, one)
+        inverse_upper_t, inverse_lower = forward_elimination(matrix, one, one)
         solve = jtu.Partial(_inverse_product, inverse_lower, inverse_upper_t.T)
         return _Equilibrated(solve, equilibration, matrix.dtype)
 
@@ -235,15 +233,14 @@ class PivotedGram(_DenseGram):
         b: Float[Array, " m"],
         *,
         pivot_tolerance: float | Array | None = None,
-        presorted: bool = False,
     ) -> Float[Array, " n"]:
         """If gradients are nearly parallel, the multipliers `(U Vᵀ)⁻¹ b` are large and cancel in
         the sum. XLA may evaluate `b` once for each of them, and round it differently each time, and
         then they do not cancel. So we do not form the multipliers. With the factors `U Vᵀ = L R` we
         compute `(R⁻ᵀ V)ᵀ (L⁻¹ b)`: the elimination takes the differences of nearly parallel rows
         before anything is large."""
-        reduced_rows, right, _ = forward_elimination(
-            self.matrix, b, directions.matrix, pivot_tolerance=pivot_tolerance, presorted=presorted
+        reduced_rows, right = forward_elimination(
+            self.matrix, b, directions.matrix, pivot_tolerance=pivot_tolerance
         )
         return _transposed_product(right, reduced_rows)
 
