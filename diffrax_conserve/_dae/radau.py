@@ -214,8 +214,17 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             y, error = freed(error, y, error)
             return found._replace(y=y, aux=error)
 
-        found = root(stages, newton, guess, systems.stages_solution, systems.stages_jacobian)
-        y, error = found.y, found.aux
+        found = root(
+            stages,
+            newton,
+            guess,
+            systems.stages_solution,
+            systems.stages_jacobian,
+            fallback=jnp.broadcast_to(start, guess.shape),
+        )
+        # What was not found may be infinite. It is discarded, but in reverse mode zero times its
+        # derivatives would be NaN.
+        y, error = jnp.where(found.ok, found.y, start), found.aux
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
         ok = found.ok & jnp.all(jnp.isfinite(error))

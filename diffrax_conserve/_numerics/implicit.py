@@ -9,6 +9,7 @@ metric, and the parameters of the user's functions.
 """
 
 import abc
+import functools as ft
 from collections.abc import Callable
 from typing import Any, final
 
@@ -164,11 +165,13 @@ def _nan_tangent_jvp(primals: Any, tangents: Any) -> tuple[Array, Array]:
 @final
 class SquareSystem(AbstractSystem):
     """Any equations, `residual(x) = 0`, with as many numbers as unknowns, and a function that
-    solves them from a guess. `solve` takes the Jacobian as `jacobian(residual)` returns it."""
+    solves them from a guess. `solve` takes the Jacobian as `jacobian(residual)` returns it. Where
+    nothing was found it differentiates at the `fallback`, as `MultiplierSystem` does."""
 
     residual: Callable[[Any], Any]
     iterate: Callable[[Any], Solved]
     guess: Any
+    fallback: Any
     solve: Callable[[Array, Float[Array, " n"]], Float[Array, " n"]] = eqx.field(static=True)
     jacobian: Callable[[Any], Callable[[Array], Array]] = eqx.field(static=True)
 
@@ -176,14 +179,15 @@ class SquareSystem(AbstractSystem):
         return self.iterate(self.guess)
 
     def linearisation_point(self, solved: Solved) -> Any:
-        return solved.y
+        return jtu.tree_map(ft.partial(jnp.where, solved.ok), solved.y, self.fallback)
 
     def equations(self, unknowns: Any) -> Any:
         return self.residual(unknowns)
 
     def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
-        matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, solved.y))))
-        return unflatten(self.solve(matrix(_flat(solved.y)), -_flat(t_equations)), solved.y)
+        x = self.linearisation_point(solved)
+        matrix = self.jacobian(lambda flat: _flat(self.residual(unflatten(flat, x))))
+        return unflatten(self.solve(matrix(_flat(x)), -_flat(t_equations)), x)
 
 
 def root(
@@ -192,13 +196,17 @@ def root(
     guess: Any,
     solve: Callable[[Array, Float[Array, " n"]], Float[Array, " n"]],
     jacobian: Callable[[Any], Callable[[Array], Array]] = jax.jacfwd,
+    *,
+    fallback: Any = None,
 ) -> Solved:
     """The root of `residual` that `iterate(guess)` finds, for unknowns that are an array or a
     PyTree of them. Its derivative is by the theorem, with `solve(matrix, vector)` for linear
     systems, where the matrix is `jacobian(residual)(unknowns)` with flat unknowns. The arrays over
-    which the functions close, such as parameters, have their derivatives too."""
+    which the functions close, such as parameters, have their derivatives too. If nothing is found
+    the derivative is that at the `fallback`, by default the guess."""
     residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
-    return implicit_solution(SquareSystem(residual, iterate, guess, solve, jacobian))
+    fallback = guess if fallback is None else fallback
+    return implicit_solution(SquareSystem(residual, iterate, guess, fallback, solve, jacobian))
 
 
 def _flat(tree: Any) -> Float[Array, " n"]:

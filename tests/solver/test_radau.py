@@ -1,6 +1,8 @@
 """Radau, on stiff equations and on differential-algebraic ones of index 1 to 3, against published
 values and exact solutions."""
 
+import functools as ft
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -23,6 +25,29 @@ def solve(term, solver, t1, y0, args, tol, *, scale=1.0, saveat=dfx.SaveAt(t1=Tr
         term, solver, 0.0, t1, 1e-6, y0, args, stepsize_controller=controller, saveat=saveat,
         **TO_THE_END,
     )  # fmt: skip
+
+
+def test_what_is_discarded_spoils_no_derivative():
+    """In reverse mode: attempts whose stages have no real root, and a lane that fails for good."""
+    dae = dfc.DAE(lambda t, x, z, a: -a * x, algebraic=lambda t, x, z, a: z - jnp.sqrt(x - 0.5))
+    y0 = jnp.array(1.0), jnp.sqrt(0.5)
+
+    @jax.jit
+    @jax.vmap
+    @ft.partial(jax.value_and_grad, has_aux=True)
+    def end(rate):
+        sol = dfx.diffeqsolve(
+            dae.term, dae.wrap(dfc.Radau()), 0.0, 1.0, 1e-3, y0, rate, throw=False, max_steps=100,
+            stepsize_controller=dfx.PIDController(1e-6, 1e-8),
+        )  # fmt: skip
+        return sol.ys[1][-1], sol.result == dfx.RESULTS.successful
+
+    rates = np.array([0.1, 0.5, 2.0])
+    (z, success), slopes = end(rates)
+    assert success.tolist() == [True, True, False]
+    x = np.exp(-rates[:2])
+    np.testing.assert_allclose(z[:2], np.sqrt(x - 0.5), rtol=1e-6)
+    np.testing.assert_allclose(slopes[:2], -x / (2 * np.sqrt(x - 0.5)), rtol=1e-5)
 
 
 # ---- Ordinary differential equations ----
