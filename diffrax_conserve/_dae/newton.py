@@ -194,7 +194,10 @@ def at_rest_near(
         # small for the next correction.
         too_short = share * BACKTRACKING_FACTOR * before <= eps**0.5
         going = (before < jnp.inf) & (better | ~too_short | ~from_one)
-        z = jnp.where(better, trial, z) + jnp.where(converged, after, 0)
+        # Where no share helps, the roundoff of one unknown may hide that another still gains by the
+        # whole correction.
+        z = jnp.where(better, trial, jnp.where(going, z, z + step))
+        z = z + jnp.where(converged, after, 0)
         longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
         share = jnp.where(better, longer, jnp.where(too_short, 1, shorter))
         from_one = (share == 1) | (from_one & ~better)

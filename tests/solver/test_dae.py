@@ -162,6 +162,32 @@ def test_a_diode_at_rest_is_a_guess_for_every_current(dtype):
     assert largest(z / (0.025 * np.log1p(current / least)) - 1) < 4 * np.finfo(dtype).eps
 
 
+def current(gate, source, drain):
+    """Of a transistor (C. Enz, F. Krummenacher and E. Vittoz, 1995), in volts and amperes."""
+    squared = lambda u: jax.nn.softplus(u / 0.0517) ** 2  # noqa: E731
+    pinch_off = (gate - 0.5) / 1.3
+    forward, reverse = squared(pinch_off - source), squared(pinch_off - drain)
+    return 1.7e-6 * (forward - reverse) * (1 + 0.1 * (drain - source))
+
+
+def test_two_inverters_have_a_state_at_every_input():
+    """One voltage is of 1e-10, the difference of two of 1.8, so that its corrections are roundoff
+    while the other still moves."""
+
+    def left_over(t, x, z, args):
+        gate = jnp.stack([x, z[0]])
+        return current(1.8 - gate, 0.0, 1.8 - z) - current(gate, 0.0, z) - 1e-12 * z
+
+    inverters = pair(lambda t, x, z, args: 0 * x, left_over)
+    x = np.linspace(0, 1.8, 37)
+    guess = np.where(x[:, None] < 0.9, [1.8, 0.0], [0.0, 1.8])
+    _, z = jax.jit(jax.vmap(inverters.consistent))(x, guess)
+    g = jax.vmap(lambda x, z: left_over(0, x, z, None))
+    matrix = jax.vmap(jax.jacfwd(lambda z, x: left_over(0, x, z, None)))(z, x)
+    more = np.linalg.solve(matrix, g(x, z)[..., None])[..., 0]
+    assert np.all(np.abs(more) <= 1e-15 + 1e-9 * np.abs(z))
+
+
 def test_a_residual_in_any_unit_is_no_root():
     """Where it changes its sign by a jump, also if the squares of its terms overflow."""
     dae = pair(lambda t, x, z, a: 0 * x, lambda t, x, z, a: a * (jnp.sign(z - x) + z - x))
