@@ -16,15 +16,16 @@ MAX_STEPS = 50
 # The directions of a correction are the gradients at the candidate for this many steps. Newton's
 # method converges quadratically, so a nearby candidate needs fewer. If these are not enough, the
 # plane of the corrections may miss the manifold, as on a circular orbit, where the states with the
-# given energy and angular momentum are a curve and not a surface. From then on the directions are
-# the gradients at each state.
+# given energy and angular momentum are a curve and not a surface. From then on, with up to
+# `MAX_BLOCK` constraints, the directions are the gradients at each state.
 FROZEN_STEPS = 6
 # A correction that does not help is shortened to this share of itself. A half needs twice as many
 # evaluations where it is far too long, and a much smaller share rejects corrections that would have
 # worked.
 BACKTRACKING_FACTOR = 1 / 4
-# Up to this many constraints the elimination is written out, element by element, so that XLA fuses
-# it with what is around it. A call of LAPACK would take most of the time of a small projection.
+# Up to this many constraints the matrix is eliminated anew at each state, with pivoting. In
+# derivatives, from far starts and within bounds that is written out, element by element, so that
+# XLA fuses it with what is around it. A call of LAPACK would take most of the time.
 MAX_UNROLLED = 4
 # Up to this many constraints a batch of nearby projections is written out in scalars. From three on
 # its kernels repeat the elimination: a step with four took 43 steps of plain RK4 in a batch of 64,

@@ -157,11 +157,11 @@ def at_rest_near(
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
     Nonlinear Problems*, Springer 2004, 3.3).
 
-    A correction is accepted if the one after it, computed with the same Jacobian, is shorter. So
-    the test compares changes of `z`, and does not depend on the units of the equations. A
-    correction that is NaN is not accepted.
+    A share `λ` of a correction is accepted if the simplified correction after it, computed with the
+    same Jacobian, is at most `1 - λ/2` times as long. So the test compares changes of `z`, and does
+    not depend on the units of the equations. A correction that is NaN is not accepted.
 
-    The iteration comes to rest where corrections have converged, which `more` tells, or where none
+    The iteration comes to rest where corrections have converged, which `aux` tells, or where none
     helps, perhaps because of roundoff: whether that is a root, the residual must tell. The result
     is NaN if corrections become infinite, or the Jacobian is singular.
     """

@@ -61,7 +61,8 @@ from .problem import (
 )
 from .rows import AbstractRows, DenseRows
 
-# A step of an iteration: from the unknowns and `tests_left` to both after it.
+# A step of an iteration: from the unknowns and `tests_left` to both after it. While `tests_left` is
+# positive it is the number of tests that are still allowed; zero means success, less a failure.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
@@ -191,9 +192,9 @@ def simplified_newton(
     *,
     max_steps: int,
 ) -> Solved:
-    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the gradients at the candidate.
-    For one or two constraints they are `directions` if these are given. Otherwise, and for up to
-    `MAX_BLOCK`, they are after `FROZEN_STEPS` iterations the gradients at the current state."""
+    """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions` if these are
+    given, for at most two constraints. Otherwise they are the gradients at the candidate, and with
+    up to `MAX_BLOCK` constraints, after `FROZEN_STEPS` iterations, those at each state."""
     assert directions is None or problem.magnitude.size <= MAX_IN_SCALARS
     if problem.magnitude.size > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
@@ -263,8 +264,9 @@ def _pivot_tolerance(level: Array, dtype: Any) -> float | Array:
 def _with_lanes_last(
     each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
 ) -> Solved:
-    """For up to `MAX_BLOCK` constraints. In a batch the lanes are the last axis of all arrays; see
-    `with_lanes_last`. The Jacobian stands at one place in the program, which makes it small.
+    """For more than `MAX_IN_SCALARS`, up to `MAX_BLOCK` constraints. In a batch the lanes are the
+    last axis of all arrays; see `with_lanes_last`. The Jacobian stands at one place in the program,
+    which makes it small.
 
     Up to `MAX_UNROLLED` constraints have a matrix of each state. Pivots that are roundoff count as
     infinite: if the other constraints hold, these hold too.
@@ -336,7 +338,8 @@ def _with_lanes_last(
 def _with_frozen_jacobian(
     problem: Problem, candidate: Float[Array, " n"], max_steps: int
 ) -> Solved:
-    """For more: the matrix is that at the candidate too, and a step evaluates only residuals.
+    """For more than `MAX_BLOCK` constraints: directions and matrix stay those at the candidate, and
+    a step evaluates only residuals.
 
     They are compared with the scales at the candidate, because those at each state would need a
     Jacobian. So at the end we test the result once more, by its own scales.

@@ -34,7 +34,7 @@ def lu_solution(factors: tuple[Array, Array], b: Array) -> Array:
 
 def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
     """Two matrices of which `right left` is the inverse, by Gaussian elimination, written out in
-    operations with rows, for a few of them. LAPACK takes longer for such matrices, and its
+    operations with rows, for a small matrix. LAPACK takes longer for such matrices, and its
     threads wait for each other on a busy machine. There is no pivoting, which `U Uᵀ` does
     not need, nor `U Vᵀ` for directions `V` near `U`.
 
@@ -55,7 +55,7 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
 
 
 def diagonal_shift(matrix: Array) -> float:
-    """What is added by default to the diagonal of a larger Gram matrix, whose elements are one."""
+    """What is added by default to the diagonal of a larger Gram matrix with a unit diagonal."""
     return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
 
 
@@ -74,7 +74,7 @@ def gram_inverse(
     To each element of the diagonal its share `added` is added, and a pivot of at most its share
     `pivot_tolerance` counts as infinite. The pivots are on the diagonal of the result, and the
     inverses of both factors take the places of the elements that were eliminated (Gauss and
-    Jordan). So no rows are exchanged: those that are left are told by their place.
+    Jordan). No rows are exchanged: the place of a row that was not yet eliminated is `m`.
 
     What is done with an element is one loop over the lanes, and the steps of the elimination are a
     loop too, so that no kernel repeats the steps before it.
@@ -96,8 +96,8 @@ def gram_inverse(
 
     def eliminate(k: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
         matrix, place = now
-        share = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
-        next_one = jnp.argmax(jnp.where(place == m, share, -1), axis=0) if ordered else k
+        relative_pivot = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
+        next_one = jnp.argmax(jnp.where(place == m, relative_pivot, -1), axis=0) if ordered else k
         is_k = j == next_one
         row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0) if ordered else matrix[k]
         column = jnp.sum(jnp.where(is_k, matrix, 0), axis=1) if ordered else matrix[:, k]

@@ -158,12 +158,14 @@ class Problem(eqx.Module):
     def level(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """The level of a state with these residuals and scales, from `NOT_FINITE` to `AT_ROUNDOFF`,
-        and the residuals that are to be corrected, with zeros for those that are noise."""
+        """The level of a state with these residuals and scales, the least over its residuals, from
+        `NOT_FINITE` to `AT_ROUNDOFF`, and the residuals that are to be corrected, with zeros for
+        those that are noise."""
         limit = self.tolerance(scale)
         noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
-        # A tolerance that underflows or is infinite would accept any state, so it counts as not
-        # met. If the scale is exactly zero, so is the residual.
+        # Where the tolerance underflows, the residual may have underflowed too, and an infinite one
+        # would accept any state, so neither counts as met. With a scale of exactly zero only a
+        # residual of exactly zero is accepted, unless `atol` is given.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         met_tolerance = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
         # We take the minimum of the levels, which are integers. A maximum of the residuals would be

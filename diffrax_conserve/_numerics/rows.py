@@ -7,10 +7,10 @@ Gram matrices are singular where constraints depend on each other, as when an in
 twice. The multipliers are then not unique, but the correction is, if the constraints do not
 contradict each other. There are three ways to solve such a system.
 
-- Up to four constraints: Gaussian elimination with diagonal pivoting, written out in
-  scalars. The next constraint is that whose gradient has the largest angle to the span of the
-  gradients before it. If the gradient is in this span, its pivot is roundoff, and the multiplier is
-  set to zero: if the other constraints hold, this one holds too. Gradients that are only nearly
+- Up to four constraints: Gaussian elimination with diagonal pivoting, written out in scalars, or
+  in a loop where `iterate` projects three and four that are near the manifold. The next constraint
+  is that whose gradient has the largest angle to the span of the gradients before it. If the
+  gradient is in this span, its pivot is roundoff, and the multiplier is set to zero: if the other constraints hold, this one holds too. Gradients that are only nearly
   parallel are all kept, because a correction needs the direction in which they differ. A derivative
   does not need it, and would lose its digits in that direction; see `implicit`. Below double
   precision, the last iteration, which only polishes, does not need it either; see `iterate`.
@@ -123,9 +123,9 @@ class AbstractRows(eqx.Module):
 class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
-    A small matrix ignores pivots of at most `pivot_tolerance`, by default roundoff, except in
-    `factorise`. A larger one adds it to its diagonal, by default a power of roundoff. A sparse one
-    ignores it.
+    A matrix of up to four rows drops pivots of at most `pivot_tolerance`, by default roundoff;
+    its `factorise` uses this default always. A larger one adds it to its unit diagonal, by default
+    `diagonal_shift`. A sparse one does not use it.
     """
 
     @abc.abstractmethod

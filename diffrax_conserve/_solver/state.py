@@ -59,9 +59,9 @@ class State(eqx.Module):
 
 
 class StepEnd(eqx.Module):
-    """The end of a step, by which the next one recognises that nothing has changed in between. At
-    the start of a solve, and in a solve that goes on from a solver state with another state, time,
-    `args` or manifold, something has.
+    """The end of a step. A step that starts there, with the same `args` and manifold, needs no test
+    of its start. The first step of a solve has one, also of a solve that goes on from a solver
+    state with other values.
 
     - `checksums`: the checksums of the state and of all numbers in `args` and in the manifold, and
       the time; infinite before the first step. They are one array, as `packed_constants` are.
