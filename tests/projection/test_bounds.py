@@ -158,7 +158,8 @@ def saved_in_a_long_step(projection, within):
 def test_saved_states_are_within_the_bounds_and_one_that_cannot_be_projected_is_told(projection):
     _, ys, off = saved_in_a_long_step(projection, jnp.array(True))
     assert jnp.min(ys) >= 0
-    assert jnp.max(jnp.abs(jnp.sum(ys, axis=1) - 1)) < 4e-15
+    # The tolerance, of the value, the amounts and their changes.
+    assert jnp.max(jnp.abs(jnp.sum(ys, axis=1) - 1)) <= 16 * EPS * 3
     assert not jnp.any(off)
     ts, ys, off = saved_in_a_long_step(projection, jnp.array(False))
     assert jnp.min(ys) >= 0

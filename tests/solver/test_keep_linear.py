@@ -86,9 +86,11 @@ def test_the_momentum_stays_beside_the_energy(solver, controller):
     kept_energy, kept_momentum, ys = moved(True)
     lost_energy, lost_momentum, others = moved(False)
     assert kept_energy < 200 * eps > lost_energy  # the energy is about 10
-    # A hundred steps of plain summation, and the small share of a correction that leaves the span.
+    # A hundred steps of plain summation, of an implicit method with its linear systems, and the
+    # small share of a correction that leaves the span.
+    summation = 500 if isinstance(solver, dfx.AbstractImplicitSolver) else 100
     assert lost_momentum > 1e-7
-    assert kept_momentum < 100 * eps + 1e-9 * lost_momentum
+    assert kept_momentum < summation * eps + 1e-9 * lost_momentum
     for y, other in zip(ys, others, strict=True):
         assert np.abs(y - other).max() < 0.05
 
