@@ -574,10 +574,16 @@ def _found(
             if unknowns
             else "So some unknown is not determined."
         )
+        repeated = (
+            f"{which}, or a derivative of it, follows from the other equations or contradicts "
+            f"them. {lacking} Leave out what is stated twice, and add the equation that is missing."
+        )
+        # With equations of unlike sizes, at a poor guess, it may be none in particular.
+        unknown = (
+            "near this state roundoff hides how they depend on the unknowns. Give another one."
+        )
         raise ValueError(
-            f"The equations are singular: {which}, or a derivative of it, follows from the "
-            f"other equations or contradicts them. {lacking} Leave out what is stated twice, "
-            f"and add the equation that is missing.{elsewhere}"
+            f"The equations are singular: {repeated if error.left else unknown}{elsewhere}"
         ) from None
     except FloatingPointError:
         raise ValueError(

@@ -188,6 +188,25 @@ def test_two_inverters_have_a_state_at_every_input():
     assert np.all(np.abs(more) <= 1e-15 + 1e-9 * np.abs(z))
 
 
+def test_a_guess_at_which_roundoff_hides_the_unknowns_is_told():
+    """An amplifier (Ebers and Moll), with 12 V where a junction has 0.7: a current of 1e187 A. No
+    equation is to blame; from zero there is a state."""
+
+    def left_over(t, x, z, args):
+        base, collector, emitter = z
+        forward, reverse = (1e-14 * jnp.expm1((base - v) / 0.02585) for v in (emitter, collector))
+        out, into = forward - 2 * reverse, forward / 100 + reverse
+        of_base = (12 - base) / 47e3 - base / 10e3 - into - (base - x) / 1e5
+        return jnp.stack([of_base, (12 - collector) / 3.3e3 - out, out + into - emitter / 1e3])
+
+    amplifier = pair(lambda t, x, z, args: -x + z[1], left_over)
+    x, z = amplifier.consistent(jnp.array(0.0), jnp.zeros(3))
+    assert largest(left_over(0.0, x, z, None)) < 1e-15
+    fresh = pair(lambda t, x, z, args: z[1] - x, left_over)
+    with pytest.raises(ValueError, match="near this state roundoff hides"):
+        fresh.consistent(x, jnp.array([12.0, 0, 0]))
+
+
 def test_a_residual_in_any_unit_is_no_root():
     """Where it changes its sign by a jump, also if the squares of its terms overflow."""
     dae = pair(lambda t, x, z, a: 0 * x, lambda t, x, z, a: a * (jnp.sign(z - x) + z - x))
