@@ -188,6 +188,21 @@ def test_two_inverters_have_a_state_at_every_input():
     assert np.all(np.abs(more) <= 1e-15 + 1e-9 * np.abs(z))
 
 
+def test_a_jump_before_a_diode_is_told_at_once():
+    """Where it is declared. There Newton's method ends far away from the state."""
+    current = lambda z: 1e-9 * jnp.expm1(z / 0.025)  # noqa: E731
+    source = lambda t: jnp.where(t > 0.25, 5.0, 0.0)  # noqa: E731
+    rectifier = pair(
+        lambda t, x, z, a: (current(z) - x / 1e4) / 1e-5,
+        lambda t, x, z, a: source(t) - x - z - 100 * current(z),
+    )
+    jump = dfx.ClipStepSizeController(dfx.PIDController(1e-6, 1e-8), jump_ts=[0.25])
+    x = jnp.array(0.0)
+    found = solve(rectifier, dfc.Radau(), x, x, None, controller=jump, dt0=0.1)
+    assert "a step cannot start" in dfx.RESULTS[found.result]
+    assert found.stats["num_steps"] < 20
+
+
 def test_a_guess_at_which_roundoff_hides_the_unknowns_is_told():
     """An amplifier (Ebers and Moll), with 12 V where a junction has 0.7: a current of 1e187 A. No
     equation is to blame; from zero there is a state."""
