@@ -48,7 +48,7 @@ $(BIN)/uv: | $(BIN)/python
 $(VENV)/.installed-%: pyproject.toml | $(BIN)/uv
 	@echo "Installing diffrax-conserve[$*] into $(VENV)"
 	@$(BIN)/uv pip install --quiet --python $(BIN)/python --editable '.[$*]' || \
-	  $(BIN)/python -m pip install --quiet --editable '.[$*]'
+	  $(BIN)/python -m pip install --quiet --no-compile --editable '.[$*]'
 	@touch $@
 
 PLOTS := $(VENV)/.installed-plots

@@ -578,12 +578,10 @@ def _found(
             f"{which}, or a derivative of it, follows from the other equations or contradicts "
             f"them. {lacking} Leave out what is stated twice, and add the equation that is missing."
         )
-        # With equations of unlike sizes, at a poor guess, it may be none in particular.
-        unknown = (
-            "near this state roundoff hides how they depend on the unknowns. Give another one."
-        )
+        # At a poor guess a rank may be lost by roundoff: then no equation is to blame.
+        hidden = "near this state roundoff hides how they depend on the unknowns. Give another one."
         raise ValueError(
-            f"The equations are singular: {repeated if error.left else unknown}{elsewhere}"
+            f"The equations are singular: {repeated if error.left else hidden}{elsewhere}"
         ) from None
     except FloatingPointError:
         raise ValueError(

@@ -46,6 +46,7 @@ from .._constants import (
 from .._fast.scalars import components, scalarised, with_lanes_last
 from .linear import (
     diagonal_shift,
+    given_order,
     gram_inverse,
     gram_solution,
     roundoff_pivot_tolerance,
@@ -308,7 +309,7 @@ def _with_lanes_last(
             if keeps_matrix:
                 kept = lax.cond(any_lane(renewed), anew, lambda: last)
                 of_matrix, factors = kept
-                place = np.arange(m).reshape(m, *[1] * len(lanes))
+                place = given_order(m, lanes)
             else:
                 kept, of_matrix = [jnp.where(renewed, rows, *last)], rows
                 factors, place = factored(rows, *kept)

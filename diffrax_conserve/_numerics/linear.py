@@ -89,7 +89,8 @@ def gram_inverse(
     else:
         pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(others, axis=1), strict=True)
         matrix = ft.reduce(op.add, (x[:, None] * y for x, y in pairs))
-    i, j = _indices(m, lanes)
+    j = given_order(m, lanes)
+    i = j[:, None]
     matrix = jnp.where(i == j, matrix + jnp.asarray(added, dtype) * matrix, matrix)
     size = jnp.abs(_diagonal(matrix))
     infinite = lambda pivot, k: jnp.where(jnp.abs(pivot) <= pivot_tolerance * k, jnp.inf, pivot)  # noqa: E731
@@ -119,7 +120,9 @@ def _diagonal(matrix: Array) -> Array:
 
 
 def gram_solution(
-    factors: Float[Array, "m m *lanes"], place: Array, b: Float[Array, "m *lanes"]
+    factors: Float[Array, "m m *lanes"],
+    place: Array | np.ndarray,
+    b: Float[Array, "m *lanes"],
 ) -> Array:
     """`(U Vᵀ)⁻¹ b`, by what `gram_inverse` returns."""
     later, earlier = place[:, None] > place, place[:, None] < place
@@ -130,10 +133,9 @@ def gram_solution(
     return (x + written_out_product(jnp.where(earlier, factors, 0), x)).astype(b.dtype)
 
 
-def _indices(m: int, lanes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Of the row, and of the column, which is that of an element of a vector."""
-    column = np.arange(m).reshape(m, *[1] * len(lanes))
-    return column[:, None], column
+def given_order(m: int, lanes: list[int]) -> np.ndarray:
+    """The place of each row in the order of elimination, if that is the given one."""
+    return np.arange(m).reshape(m, *[1] * len(lanes))
 
 
 def written_out_product(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:

@@ -71,11 +71,11 @@ class AbstractRows(eqx.Module):
         """`U diag(x)`."""
 
     @abc.abstractmethod
-    def divide_rows(self: Rows, row_scales: Float[Array, " m"]) -> Rows:
+    def divide_rows(self: Rows, row_scales: Float[Array, "m *lanes"]) -> Rows:
         """`diag(row_scales)⁻¹ U`."""
 
     @abc.abstractmethod
-    def largest(self) -> Float[Array, " m"]:
+    def largest(self) -> Float[Array, "m *lanes"]:
         """The absolute value of the largest element of each row."""
 
     @abc.abstractmethod
@@ -90,16 +90,17 @@ class AbstractRows(eqx.Module):
         """`|U| x`."""
         return jtu.tree_map(jnp.abs, self).matvec(x)
 
-    def equilibrated(self: Rows) -> tuple[Float[Array, " m"], Rows]:
+    def equilibrated(self: Rows) -> tuple[Float[Array, "m *lanes"], Rows]:
         """The scales of the rows, and the rows divided by them. A scale is the largest element of
         its row, or one if all are zero.
 
         The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
         they do not in usual units, so there the scales are one, which saves time.
         """
-        row_scales = self.largest()
         if self.dtype == jnp.float64:
-            return jnp.ones_like(row_scales), self
+            like = jax.eval_shape(self.largest)  # with the lanes, if they are the last axis
+            return jnp.ones(like.shape, like.dtype), self
+        row_scales = self.largest()
         row_scales = jnp.where(row_scales > 0, row_scales, 1)
         return row_scales, self.divide_rows(row_scales)
 
@@ -159,9 +160,9 @@ class AbstractGram(eqx.Module):
 
 @final
 class DenseRows(AbstractRows):
-    """Rows as a matrix."""
+    """Rows as a matrix, alone or with the lanes of a batch as the last axis."""
 
-    matrix: Float[Array, "m n"]
+    matrix: Float[Array, "m n *lanes"]
 
     def __len__(self) -> int:
         return len(self.matrix)
@@ -181,10 +182,10 @@ class DenseRows(AbstractRows):
     def scale_columns(self, x: Float[Array, " n"]) -> "DenseRows":
         return DenseRows(self.matrix * jnp.broadcast_to(x, self.matrix.shape))
 
-    def divide_rows(self, row_scales: Float[Array, " m"]) -> "DenseRows":
+    def divide_rows(self, row_scales: Float[Array, "m *lanes"]) -> "DenseRows":
         return DenseRows(self.matrix / row_scales[:, None])
 
-    def largest(self) -> Float[Array, " m"]:
+    def largest(self) -> Float[Array, "m *lanes"]:
         return jnp.max(jnp.abs(self.matrix), axis=1)
 
     def apply(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
