@@ -5,11 +5,11 @@
 # units of roundoff" is part of the documentation, and `tests/soak` checks it in long double. What
 # else is compared with roundoff, such as the pivot of a constraint that depends on others, is
 # compared with this many units of it.
-ROUNDOFF = 16
+TOLERANCE_IN_EPS = 16
 # A residual of this many units is noise: rounding the state and evaluating the residual contribute
 # about one unit each. An iteration can reduce it by chance only, so it is not corrected. Where the
 # user sets a tolerance, noise is the same share of it, an eighth.
-NOISE = 2
+NOISE_IN_EPS = 2
 # Newton's method makes at most this many iterations, unless the user says otherwise. In a solve two
 # are usual. More are needed after a step of the solver that is much too long.
 MAX_STEPS = 50
@@ -23,14 +23,8 @@ FROZEN_STEPS = 6
 # evaluations where it is far too long, and a much smaller share rejects corrections that would have
 # worked.
 BACKTRACKING_FACTOR = 1 / 4
-# Up to this many constraints the matrix is eliminated anew at each state, with pivoting. In
-# derivatives, from far starts and within bounds that is written out, element by element, so that
-# XLA fuses it with what is around it. A call of LAPACK would take most of the time.
+# Up to this many constraints the matrix is eliminated anew at each state, with pivoting.
 MAX_UNROLLED = 4
-# Up to this many constraints a batch of nearby projections is written out in scalars. From three on
-# its kernels repeat the elimination: a step with four took 43 steps of plain RK4 in a batch of 64,
-# and 15 with the lanes as the last axis (`benchmarks/cost/few_constraints.py`).
-MAX_IN_SCALARS = 2
 # This power of roundoff, times the root of the number of constraints, is added to the diagonal of
 # larger matrices, as a share of it, so that they can be factored where constraints depend on each
 # other. The residuals of such constraints contradict each other by roundoff, which becomes an error

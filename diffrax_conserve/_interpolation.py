@@ -31,8 +31,9 @@ from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
 
 @final
 class AsArrays(eqx.Module):
-    """A module, such as a `Target`, in the form in which `dense_info` can store it. diffrax copies
-    the leaves of `dense_info` into arrays over the steps, so that only arrays may be leaves."""
+    """A module, such as a `TargetManifold`, in the form in which `dense_info` can store it. diffrax
+    copies the leaves of `dense_info` into arrays over the steps, so that only arrays may be
+    leaves."""
 
     arrays: PyTree[Array]
     static: Any = eqx.field(static=True)

@@ -184,9 +184,8 @@ def decide_success_by_the_scale_at_the_candidate(package):
 
 
 def polish_along_nearly_parallel_gradients(package):
-    package.around("PivotedGram.row_space_correction")(
-        lambda given, *x, pivot_tolerance=None, **y: given(*x, **y)
-    )
+    tolerance = lambda status, dtype: 16 * float(jnp.finfo(dtype).eps)  # noqa: E731
+    package.replace("_pivot_tolerance", tolerance)
 
 
 def divide_by_every_pivot_in_derivatives(package):
@@ -220,13 +219,13 @@ def leave_what_was_added_to_the_diagonal(package):
 
 
 def divide_by_the_roundoff_of_a_pivot(package):
-    package.in_module_of("forward_elimination", "ROUNDOFF", 0)
+    package.in_module_of("forward_elimination", "TOLERANCE_IN_EPS", 0)
 
 
 def eliminate_in_the_given_order(package):
-    @package.around("gram_inverse")
-    def _(old, *rows, ordered=False, **options):
-        return old(*rows, **options)
+    @package.around("gauss_jordan")
+    def _(old, matrix, *, ordered=False, **options):
+        return old(matrix, **options)
 
 
 def cross_kinks_in_full_steps(package):

@@ -35,7 +35,7 @@ from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
-from .._tree import ravel, tree_all_finite, tree_shapes, unravel
+from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .large import SparseMatrix
 from .large_search import NotFound
 from .newton import (
@@ -649,8 +649,9 @@ class ConstraintProjection(AbstractProjection):
         if structure.index != 1:
             metric, one = problem.factor, jnp.ones_like(candidate)
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
-            free = dataclasses.replace(problem, factor=Diagonal(structure.units(sizes)))
-            y, info = SimplifiedNewton().solve(free, candidate)
+            jacobian = tree_stop_gradient(problem.linearise(candidate)[1])
+            free = Diagonal(structure.equilibrated_units(sizes, jacobian))
+            y, info = SimplifiedNewton().solve(dataclasses.replace(problem, factor=free), candidate)
             length = lax.stop_gradient(metric.norm(y - candidate))
             return y, dataclasses.replace(info, correction=length)
         if structure.large is not None:

@@ -8,7 +8,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import BACKTRACKING_FACTOR, ROUNDOFF
+from .._constants import BACKTRACKING_FACTOR, TOLERANCE_IN_EPS
 from .._large.klu import Places, RealFactor, SparseJacobian
 from .._numerics.iterate import Solved, any_lane, iterate, left_after_step, where_active
 from .._numerics.linear import lu_factors, lu_solution
@@ -66,7 +66,7 @@ class _Factored(NamedTuple):
 
     def regular(self) -> Bool[Array, ""]:
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
-        return jnp.all(pivots > ROUNDOFF * eps_of(pivots))
+        return jnp.all(pivots > TOLERANCE_IN_EPS * eps_of(pivots))
 
     def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
         """For each unknown the least change that the largest term of one of its equations stands
@@ -114,7 +114,7 @@ class SparseNewton:
 
     def at_roundoff(self, residual: Residual, z: Float[Array, " m"]) -> Bool[Array, ""]:
         sizes = self.places.matvec(jnp.abs(self.found.values(residual, z)), jnp.abs(z))
-        return jnp.all(jnp.abs(residual(z)) <= ROUNDOFF * eps_of(z) * sizes)
+        return jnp.all(jnp.abs(residual(z)) <= TOLERANCE_IN_EPS * eps_of(z) * sizes)
 
     def jacobian(self, residual: Residual) -> Residual:
         return lambda z: self.found.values(residual, z)
@@ -138,9 +138,9 @@ def algebraic_newton(
     def at_roundoff() -> Bool[Array, ""]:
         if sparse is not None:
             return sparse.at_roundoff(residual, z)
-        g, jacobian, hidden = cancellation_terms(residual, z)
-        limit = ROUNDOFF * eps_of(z)
-        scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + hidden
+        g, jacobian, cancellation = cancellation_terms(residual, z)
+        limit = TOLERANCE_IN_EPS * eps_of(z)
+        scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + cancellation
         # The square of a term may be infinite, and then so is the scale.
         return jnp.all((jnp.abs(g) <= limit * scale) & (scale < jnp.inf))
 
@@ -157,9 +157,10 @@ def at_rest_near(
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
     Nonlinear Problems*, Springer 2004, 3.3).
 
-    A share `λ` of a correction is accepted if the simplified correction after it, computed with the
-    same Jacobian, is at most `1 - λ/2` times as long. So the test compares changes of `z`, and does
-    not depend on the units of the equations. A correction that is NaN is not accepted.
+    A correction times the damping factor `λ` is accepted if the simplified correction after it,
+    computed with the same Jacobian, is at most `1 - λ/2` times as long. So the test compares
+    changes of `z`, and does not depend on the units of the equations. A correction that is NaN is
+    not accepted.
 
     The iteration comes to rest where corrections have converged, which `aux` tells, or where none
     helps, perhaps because of roundoff: whether that is a root, the residual must tell. The result
@@ -169,42 +170,42 @@ def at_rest_near(
     linearised = _Factored.at if sparse is None else sparse.at
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        # The unknowns, the share of the correction to try next, whether all larger shares have been
-        # tried at these unknowns, and whether they have converged.
-        z, share, from_one, _ = now
+        # The unknowns, the damping factor to try next, whether all larger ones have been tried at
+        # these unknowns, and whether they have converged.
+        z, damping, larger_tried, _ = now
         factored = linearised(residual, z)
-        step = factored.correction(residual(z))
-        trial = z + share * step
-        after = factored.freed(factored.correction(residual(trial), step))
+        correction = factored.correction(residual(z))
+        trial = z + damping * correction
+        simplified = factored.freed(factored.correction(residual(trial), correction))
         size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.
         size = size + eps**0.5 * factored.least_changes(size)
         size = jnp.where(size > 0, jnp.maximum(size, least_exact(z.dtype)), 1)
-        before, then = (jnp.max(jnp.abs(d) / size, initial=0) for d in (step, after))
-        # Where the linear model is exact, the next correction is `1 - share` times as long. We ask
-        # for half of that gain.
-        better = then <= (1 - share / 2) * before
-        # The later corrections shrink at least by the same ratio, `then / before`. So the one that
-        # would follow both is at most `then² / before`, which is roundoff here.
-        converged = better & (share == 1) & (then * then <= eps * before)
+        norm = lambda x: jnp.max(jnp.abs(x) / size, initial=0)  # noqa: E731
+        length, simplified_length = norm(correction), norm(simplified)
+        # Where the linear model is exact, the simplified correction is `1 - damping` times as long.
+        # We ask for half of that gain.
+        better = simplified_length <= (1 - damping / 2) * length
+        # The later corrections shrink at least by the same ratio. So the one that would follow both
+        # is at most `simplified_length² / length`, which is roundoff here.
+        converged = better & (damping == 1) & (simplified_length**2 <= eps * length)
         # If a change of at most `√ε` does not help, it is probably roundoff that keeps it from
-        # helping. From a poor guess it may be a tiny share of the correction, which for a diode at
-        # rest is longer than the voltage by the ratio of the currents; and that share may be too
+        # helping. From a poor guess the damping factor may be tiny, because for a diode at rest the
+        # correction is longer than the voltage by the ratio of the currents; and it may be too
         # small for the next correction.
-        too_short = share * BACKTRACKING_FACTOR * before <= eps**0.5
-        going = (before < jnp.inf) & (better | ~too_short | ~from_one)
-        # Where no share helps, the roundoff of one unknown may hide that another still gains by the
+        too_short = damping * BACKTRACKING_FACTOR * length <= eps**0.5
+        going = (length < jnp.inf) & (better | ~too_short | ~larger_tried)
+        # Where no damping helps, roundoff of one unknown may hide that another still gains by the
         # whole correction.
-        z = jnp.where(better, trial, jnp.where(going, z, z + step))
-        z = z + jnp.where(converged, after, 0)
-        longer, shorter = jnp.minimum(share / BACKTRACKING_FACTOR, 1), share * BACKTRACKING_FACTOR
-        share = jnp.where(better, longer, jnp.where(too_short, 1, shorter))
-        from_one = (share == 1) | (from_one & ~better)
-        at_rest = (converged | (~going & (before < jnp.inf))) & factored.regular()
-        return where_active(tests_left, (z, share, from_one, converged), now), left_after_step(
-            at_rest, going, tests_left
-        )
+        z = jnp.where(better, trial, jnp.where(going, z, z + correction))
+        z = z + jnp.where(converged, simplified, 0)
+        less, more = jnp.minimum(damping / BACKTRACKING_FACTOR, 1), damping * BACKTRACKING_FACTOR
+        damping = jnp.where(better, less, jnp.where(too_short, 1, more))
+        larger_tried = (damping == 1) | (larger_tried & ~better)
+        at_rest = (converged | (~going & (length < jnp.inf))) & factored.regular()
+        moved = where_active(tests_left, (z, damping, larger_tried, converged), now)
+        return moved, left_after_step(at_rest, going, tests_left)
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(True), jnp.asarray(False)
     (z, *_, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from .._constants import ROUNDOFF
+from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
@@ -168,7 +168,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         # A residual below the roundoff of its terms tells no error: in float32 the last of many
         # unknowns with the sum 1 is known to 1e-7, whatever its size and its tolerance are.
         sizes = systems.sizes_of_terms(start, start / length)
-        least = ROUNDOFF * eps_of(start) * sizes
+        least = TOLERANCE_IN_EPS * eps_of(start) * sizes
         seen = lambda residual: jnp.where(jnp.abs(residual) <= least, 0, residual)  # noqa: E731
         finder, pair_dtype = self.root_finder, jnp.result_type(start, complex(0))
 
@@ -196,7 +196,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 now_size = size(change, new)
                 rate = jnp.where(before < jnp.inf, now_size / before, 0.5)
                 # A change by the roundoff of the state cannot become smaller.
-                rounded = now_size <= size(ROUNDOFF * eps_of(new) * new, new)
+                rounded = now_size <= size(TOLERANCE_IN_EPS * eps_of(new) * new, new)
                 converged = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
                 then = left_after_step(converged, rate < 2, tests_left)
                 return where_active(tests_left, (new, now_size), now), then

@@ -30,6 +30,7 @@ from .._fast.arrays import folded
 from .._fast.run_once import RunOnce
 from .._fast.scalars import small
 from .._numerics.implicit import root
+from .._numerics.rows import AbstractRows
 from .._tree import eps_of, irregular_weights
 from .large import Large
 from .newton import SparseNewton, algebraic_newton, divided
@@ -123,9 +124,29 @@ class Structure:
     def units(self, sizes: Float[Array, " n"]) -> Float[Array, " n"]:
         """The units of a projection in which unknowns without slopes, such as forces, are free:
         what they can correct moves no other unknown."""
-        free = np.isin(np.arange(self.size), self.algebraic)
         some = jnp.where(sizes > 0, sizes, 1)
-        return jnp.where(free, some / eps_of(sizes), sizes)
+        return jnp.where(self._is_free, some / eps_of(sizes), sizes)
+
+    def equilibrated_units(
+        self, sizes: Float[Array, " n"], jacobian: AbstractRows
+    ) -> Float[Array, " n"]:
+        """As `units`, for a constraint Jacobian. The sizes of unknowns without slopes are not used:
+        they may have any ratios, as at a start where some vanish, and a Gram matrix would square
+        these. Their units are such that the largest element in the column of each is one, where the
+        largest element of each row is one; and all are so large that in each row one of them
+        exceeds what the other unknowns contribute by the factor `1/ε`."""
+        others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest()
+        free = jacobian.scale_columns(jnp.asarray(self._is_free, sizes.dtype))
+        largest = free.largest()
+        is_zero, divisor = largest == 0, jnp.where(largest > 0, largest, 1)
+        column = free.divide_rows(divisor).largest_in_columns(self.size)
+        factor = jnp.max(jnp.where(is_zero, 0, others / divisor), initial=0)
+        factor = jnp.where(factor > 0, factor, 1) / eps_of(sizes)
+        return jnp.where(self._is_free, factor / jnp.where(column > 0, column, 1), sizes)
+
+    @property
+    def _is_free(self) -> Bool[np.ndarray, " n"]:
+        return np.isin(np.arange(self.size), self.algebraic)
 
     def stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are

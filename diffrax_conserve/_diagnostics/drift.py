@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool
 
 from .._balance import has_rates, integrated_rates
-from .._constants import ROUNDOFF
+from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._manifold import (
     check_manifold,
@@ -131,7 +131,7 @@ def off_manifold(sol: dfx.Solution, manifold: Manifold, args: Args = None) -> Bo
         g = ravel(residual(t, y))
         _, jacobian, hidden = cancellation_scale(manifold, t, y, args)
         scale = numbers + jacobian.absolute_matvec(jnp.abs(ravel(y))) + hidden
-        limit = 2 * ROUNDOFF * eps_of(g) * scale
+        limit = 2 * TOLERANCE_IN_EPS * eps_of(g) * scale
         return ~jnp.all((jnp.abs(g) <= limit) | jnp.isinf(t))
 
     return jax.vmap(at)(ts, ys)

@@ -25,7 +25,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxtyping import Array, Bool, Float, Shaped
 
-from .._constants import DENSE_ROW_RATIO, ROUNDOFF
+from .._constants import DENSE_ROW_RATIO, TOLERANCE_IN_EPS
 from .._memory import Memory
 from .._tree import eps_of, irregular_weights
 from .detection import NotSparse, coloured, constants_of, content_key, jacobian_places
@@ -211,7 +211,7 @@ def _analyzed(places: Places) -> Any:
 
 def is_bounded(x: Array) -> Bool[Array, ""]:
     """Whether a solution shows that a matrix is regular to roundoff."""
-    return jnp.all(jnp.abs(x) < 1 / (ROUNDOFF * eps_of(x)))
+    return jnp.all(jnp.abs(x) < 1 / (TOLERANCE_IN_EPS * eps_of(x)))
 
 
 # ---- Factors that are kept ----

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from .._constants import MAX_STEPS, ROUNDOFF
+from .._constants import MAX_STEPS, TOLERANCE_IN_EPS
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
@@ -96,14 +96,14 @@ class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
 
         guess = ravel(jtu.tree_map(lambda k, unit: k / unit, k0, units))
         eps = eps_of(guess)
-        finder = optx.Chord(rtol=0.0, atol=ROUNDOFF * eps, norm=optx.max_norm)
+        finder = optx.Chord(rtol=0.0, atol=TOLERANCE_IN_EPS * eps, norm=optx.max_norm)
 
         def newton(guess: Float[Array, " n"]) -> Solved:
-            found = optx.root_find(
+            solution = optx.root_find(
                 relation, finder, guess, max_steps=self.root_find_max_steps, throw=False
             )
-            ok = found.result == optx.RESULTS.successful
-            return Solved(found.value, ok, found.stats["num_steps"], found.result)
+            ok = solution.result == optx.RESULTS.successful
+            return Solved(solution.value, ok, solution.stats["num_steps"], solution.result)
 
         # The derivative is not that of `root_find`: its linear solver refuses NaN, so that one lane
         # of a batch that has failed would be an error of all.

@@ -220,7 +220,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         # The constraint changes at the rate `∂_t g + G v`. It counts as zero if it is at most `√ε`
         # of the largest rate that velocities of this length can cause: by the inequality of Cauchy
         # and Schwarz `|∂_t g|` plus the length of a row of `G S` times the length of `S⁻¹ v`.
-        squares = jax.tree.map(jnp.square, problem.factor.scale_columns(at.jacobian))
+        squares = jax.tree.map(jnp.square, problem.factor.scaled_rows(at.jacobian))
         lengths = jnp.sqrt(squares.matvec(jnp.ones_like(ravel(v))))
         limit = lengths * problem.factor.norm(drift(ravel(v))) + jnp.abs(rate)
         moves = rate + at.jacobian.matvec(drift(ravel(v)))
@@ -303,7 +303,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         applied to each row. With many constraints the derivative is taken as diagonal. If it is
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
-        forces = problem.factor.scale_columns(problem.factor.scale_columns(jacobian))
+        forces = problem.factor.scaled_rows(problem.factor.scaled_rows(jacobian))
         return jacobian.gram(forces.apply(lambda x: jax.jvp(drift, (p,), (x,))[1], p.size))
 
     def _linear(
@@ -345,7 +345,7 @@ _barrier = lax.optimization_barrier
 
 def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
     """`M⁻¹ Gᵀ λ`."""
-    return problem.factor.scale_gradient(problem.factor.scale_gradient(rows.rmatvec(multiplier)))
+    return problem.factor.scaled_gradient(problem.factor.scaled_gradient(rows.rmatvec(multiplier)))
 
 
 def _shake(
@@ -370,8 +370,8 @@ def _shake(
 
     def advance(x: Array, tests_left: Array) -> tuple[Array, Array]:
         g = _barrier(problem.residual(_barrier(position(x))))
-        level, _ = problem.level(g, scale)
-        tests_left = left_after_test(level, tests_left)
+        status, _ = problem.status(g, scale)
+        tests_left = left_after_test(status, tests_left)
         return where_active(tests_left, x - change(g), x), tests_left
 
     return iterate(advance, guess, max_steps=max_steps)

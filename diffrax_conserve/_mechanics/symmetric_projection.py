@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._balance import refuse_rates
-from .._constants import MAX_STEPS, NOISE, ROUNDOFF
+from .._constants import MAX_STEPS, NOISE_IN_EPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import AsArrays
 from .._manifold import check_manifold
@@ -227,7 +227,7 @@ projection. Of other methods it cannot be told: try a solve forwards and backwar
 def _along(problem: Problem, y: Float[Array, " n"], multiplier: Array) -> Float[Array, " n"]:
     """`M⁻¹ G(y)ᵀ μ`, by one reverse pass."""
     _, vjp = jax.vjp(problem.residual, y)
-    return problem.factor.to_state(problem.factor.scale_gradient(vjp(multiplier)[0]))
+    return problem.factor.to_state(problem.factor.scaled_gradient(vjp(multiplier)[0]))
 
 
 def _solved(
@@ -254,17 +254,19 @@ def _solved(
 
     def advance(now: _Unknowns, tests_left: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
-        rows = end.factor.scale_columns(jacobian)
-        level, to_correct = end.level(g, end.scale(jacobian, now.y))
+        rows = end.factor.scaled_rows(jacobian)
+        status, to_correct = end.status(g, end.scale(jacobian, now.y))
         # The residual of the equation for the state, with the gradients at that state.
         defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
         off = end.factor.norm(defect) / (eps * end.factor.norm(jnp.abs(y0) + jnp.abs(now.y)))
         off = jnp.where(jnp.all(defect == 0), 0, off)
         solved = jnp.where(
-            off <= NOISE, AT_ROUNDOFF, jnp.where(off <= ROUNDOFF, WITHIN_TOLERANCE, ABOVE_TOLERANCE)
+            off <= NOISE_IN_EPS,
+            AT_ROUNDOFF,
+            jnp.where(off <= TOLERANCE_IN_EPS, WITHIN_TOLERANCE, ABOVE_TOLERANCE),
         )
         solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)
-        tests_left = left_after_test(jnp.minimum(level, solved), tests_left)
+        tests_left = left_after_test(jnp.minimum(status, solved), tests_left)
         # Where the inner step has failed, there is nothing to go on with.
         tests_left = jnp.where(now.result == dfx.RESULTS.successful, tests_left, -1)
 
@@ -277,9 +279,9 @@ def _solved(
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)
         return where_active(tests_left, moved, now), tests_left
 
-    found = iterate(advance, stepped(guess[1]), max_steps=max_steps)
-    y, multiplier, candidate, result = found.y
-    return Solved((y, multiplier), found.ok, found.num_iterations + 1, (candidate, result))
+    solved = iterate(advance, stepped(guess[1]), max_steps=max_steps)
+    y, multiplier, candidate, result = solved.y
+    return Solved((y, multiplier), solved.ok, solved.num_iterations + 1, (candidate, result))
 
 
 def _check_symmetric(solver: Any) -> None:

@@ -127,7 +127,7 @@ class MultiplierSystem(AbstractSystem):
             change = self.directions.rmatvec(multiplier)
         else:  # `G(ŷ)ᵀ λ` by one reverse pass, instead of one for each row of `G`
             _, vjp = jax.vjp(self.problem.residual, start)
-            change = self.problem.factor.scale_gradient(vjp(multiplier)[0])
+            change = self.problem.factor.scaled_gradient(vjp(multiplier)[0])
         end = start + self.problem.factor.to_state(change)
         # Both are evaluated at the state, so that the tangent of `g` contains that of the state.
         return end, self.problem.residual(end)

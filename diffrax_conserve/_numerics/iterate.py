@@ -38,17 +38,17 @@ from .._constants import (
     BACKTRACKING_FACTOR,
     FROZEN_STEPS,
     MAX_BLOCK,
-    MAX_IN_SCALARS,
     MAX_UNROLLED,
-    ROUNDOFF,
     SLOPE_BEYOND_BOUNDS,
+    TOLERANCE_IN_EPS,
 )
-from .._fast.scalars import components, scalarised, with_lanes_last
+from .._fast.scalars import with_lanes_last
 from .linear import (
     diagonal_shift,
+    gauss_jordan,
+    gauss_jordan_solution,
     given_order,
-    gram_inverse,
-    gram_solution,
+    gram_matrix,
     roundoff_pivot_tolerance,
     written_out_product,
 )
@@ -68,7 +68,7 @@ Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
 class Solved(NamedTuple):
-    """What an iteration has found.
+    """What an iteration has solved.
 
     - `y`: the unknowns. In a projection they are the state.
     - `ok`: whether they solve the equations.
@@ -113,8 +113,8 @@ def initial_tests(max_steps: int) -> Int[Array, ""]:
     return jnp.asarray(max_steps + 1, np.min_scalar_type(-max_steps - 2))
 
 
-def left_after_test(level: Array, tests_left: Array, *, polish: bool = True) -> Array:
-    """The number of tests that are left after unknowns of this `level` were tested.
+def left_after_test(status: Array, tests_left: Array, *, polish: bool = True) -> Array:
+    """The number of tests that are left after unknowns of this `status` were tested.
 
     At `AT_ROUNDOFF` the iteration ends. Where the unknowns are merely within the tolerance, one
     more step brings the residual to roundoff, if `polish` asks for it; should that step leave the
@@ -122,12 +122,12 @@ def left_after_test(level: Array, tests_left: Array, *, polish: bool = True) -> 
     more step takes the NaN to the unknowns, where everybody sees it. If no test is left and the
     unknowns do not solve the equations, the iteration has failed.
     """
-    then = jnp.where(level == NOT_FINITE, jnp.minimum(tests_left - 1, 1), tests_left - 1)
-    then = jnp.where((level < WITHIN_TOLERANCE) & (then == 0), -1, then)
+    then = jnp.where(status == NOT_FINITE, jnp.minimum(tests_left - 1, 1), tests_left - 1)
+    then = jnp.where((status < WITHIN_TOLERANCE) & (then == 0), -1, then)
     then = jnp.where(
-        level == WITHIN_TOLERANCE, jnp.where(tests_left > 2, 2, 0) if polish else 0, then
+        status == WITHIN_TOLERANCE, jnp.where(tests_left > 2, 2, 0) if polish else 0, then
     )
-    then = jnp.where(level == AT_ROUNDOFF, 0, then)
+    then = jnp.where(status == AT_ROUNDOFF, 0, then)
     return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 
 
@@ -155,29 +155,6 @@ def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[
     return any_lane(jnp.any(flags)), False
 
 
-def with_batch_flag(run: Callable[[Any, bool], Any], given: Any) -> Any:
-    """`run(given, is_batched)`, a PyTree of arrays. The flag tells whether a `vmap` is around it.
-
-    Both variants are jitted, so that JAX traces each once, although it batches the loop over the
-    steps of a solve several times.
-    """
-    arrays, static = eqx.partition(given, eqx.is_array)
-
-    def variant(is_batched: bool) -> Callable[[Any], Any]:
-        return jax.jit(lambda arrays: run(eqx.combine(arrays, static), is_batched))
-
-    unbatched, lane = jax.custom_batching.custom_vmap(variant(False)), variant(True)
-
-    @unbatched.def_vmap
-    def batched(size: int, axes: Any, arrays: Any) -> Any:
-        del size
-        (axes,) = jtu.tree_map(lambda batched: 0 if batched else None, axes)
-        out = jax.vmap(lane, (axes,))(arrays)
-        return out, jtu.tree_map(lambda x: True, out)
-
-    return unbatched(arrays)
-
-
 def where_active(tests_left: Array, moved: Any, y: Any) -> Any:
     """The moved unknowns where the iteration goes on, and the old ones where it is done."""
     return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
@@ -194,80 +171,30 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions` if these are
-    given, for at most two constraints. Otherwise they are the gradients at the candidate, and with
-    up to `MAX_BLOCK` constraints, after `FROZEN_STEPS` iterations, those at each state."""
-    assert directions is None or problem.magnitude.size <= MAX_IN_SCALARS
-    if problem.magnitude.size > MAX_BLOCK:
+    given, for at most `MAX_UNROLLED` constraints. Otherwise they are the gradients at the
+    candidate, and with up to `MAX_BLOCK` constraints, after `FROZEN_STEPS` iterations, those at
+    each state."""
+    m = problem.num_residuals
+    assert directions is None or m <= MAX_UNROLLED
+    if m > MAX_BLOCK:
         return _with_frozen_jacobian(problem, candidate, max_steps)
-    if problem.magnitude.size > MAX_IN_SCALARS:
-        run = ft.partial(_with_lanes_last, max_steps=max_steps)
-        return with_lanes_last(run, problem, candidate)
-    run = ft.partial(_with_fresh_jacobians, max_steps=max_steps)
-    return with_batch_flag(run, (problem, candidate, directions))
+    return with_lanes_last(
+        ft.partial(_of_few_constraints, m, directions is not None, max_steps),
+        (problem, directions),
+        candidate,
+    )
 
 
-def _with_fresh_jacobians(given: Any, is_batched: bool, *, max_steps: int) -> Solved:
-    """Each step has a Jacobian and an elimination of its own. In the lanes of a batch it is written
-    out in scalars, which XLA fuses to one kernel; alone it is fastest in arrays."""
-    problem, candidate, directions = given
-    dtype = problem.magnitude.dtype
-
-    def loop_invariants(y: Any) -> Any:
-        """The given directions, or the gradients at the candidate."""
-        rows = problem.gradients(y).equilibrated()[1] if directions is None else directions
-        return rows.matrix  # pyright: ignore
-
-    def advance(fixed: Any, y: Any, tests_left: Array) -> tuple[Any, Array]:
-        linearised = problem.linearise(y)
-        # Without a barrier XLA would evaluate the residuals once for each use of them.
-        g, jacobian = linearised if is_batched else lax.optimization_barrier(linearised)
-        level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
-        may_switch = directions is None and max_steps > FROZEN_STEPS
-        # We count by the number before `left_after_test`, which may set it to two for a step that
-        # polishes. If that step leaves the tolerance, the next one is along the current gradients.
-        frozen = tests_left > max_steps + 1 - FROZEN_STEPS
-        current = DenseRows(jnp.where(frozen, fixed, rows.matrix) if may_switch else fixed)  # pyright: ignore
-        tests_left = left_after_test(level, tests_left)
-        pivot_tolerance = _pivot_tolerance(level, dtype)
-        change = rows.gram(current).row_space_correction(
-            current, to_correct / row_scales, pivot_tolerance=pivot_tolerance
-        )
-        newton_point = y - problem.factor.to_state(change)
-        return where_active(tests_left, newton_point, y), tests_left
-
-    if is_batched:
-        like = jax.eval_shape(loop_invariants, candidate), candidate, initial_tests(max_steps)
-        start, step = scalarised(loop_invariants, candidate), scalarised(advance, *like)
-        if start and step and candidate.size:
-            y = components(candidate)
-            solved = iterate(ft.partial(step, start(y)), y, max_steps=max_steps)
-            return solved._replace(y=jnp.stack(solved.y))
-        y = candidate
-    else:
-        # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate
-        # that step once for each use of the candidate.
-        y = lax.optimization_barrier(candidate)
-    return iterate(ft.partial(advance, loop_invariants(y)), y, max_steps=max_steps)
-
-
-def _pivot_tolerance(level: Array, dtype: Any) -> float | Array:
-    """A step that only polishes is as long as roundoff divided by the sine of the angle between
-    gradients. So that it is at most `ROUNDOFF` times as long as with a right angle, constraints
-    with a sine of at most `1 / ROUNDOFF` take no part in it. In float64 it is short in any case,
-    and a batch is faster without the distinction."""
-    roundoff = roundoff_pivot_tolerance(dtype)
-    if dtype == jnp.float64:
-        return roundoff
-    return jnp.where(level < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / ROUNDOFF**2))
-
-
-def _with_lanes_last(
-    each: Callable[..., Any], candidate: Array, is_batched: bool, *, max_steps: int
+def _of_few_constraints(
+    m: int,
+    has_directions: bool,
+    max_steps: int,
+    map_lanes: Callable[..., Any],
+    candidate: Array,
+    is_batched: bool,
 ) -> Solved:
-    """For more than `MAX_IN_SCALARS`, up to `MAX_BLOCK` constraints. In a batch the lanes are the
-    last axis of all arrays; see `with_lanes_last`. The Jacobian stands at one place in the program,
-    which makes it small.
+    """For up to `MAX_BLOCK` constraints. In a batch the lanes are the last axis of all arrays; see
+    `with_lanes_last`. The Jacobian stands at one place in the program, which makes it small.
 
     Up to `MAX_UNROLLED` constraints have a matrix of each state. Pivots that are roundoff count as
     infinite: if the other constraints hold, these hold too.
@@ -280,44 +207,50 @@ def _with_lanes_last(
     millionth, as near a circular orbit. What the first steps have left over may be in such a
     direction, so after them only roundoff is added.
     """
+    keeps_matrix = m > MAX_UNROLLED
 
-    def tested(problem: Problem, y: Array) -> tuple[Array, ...]:
+    def tested(given: Any, y: Array) -> tuple[Array, ...]:
+        problem, _ = given
         g, jacobian = problem.linearise(y)
-        level, to_correct = problem.level(g, problem.scale(jacobian, y))
-        return level, to_correct, problem.factor.scale_columns(jacobian).matrix  # pyright: ignore
+        status, to_correct = problem.status(g, problem.scale(jacobian, y))
+        return status, to_correct, problem.factor.scaled_rows(jacobian).matrix
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
-        y, *last = now
-        level, to_correct, rows = each(tested)(y)
-        is_first, is_late = tests_left > max_steps, tests_left <= max_steps + 1 - FROZEN_STEPS
-        tests_left = left_after_test(level, tests_left)
-        renewed = is_first | (is_late & (tests_left > 0))
+        y, *previous = now
+        status, to_correct, rows = map_lanes(tested)(y)
+        is_first, frozen = tests_left > max_steps, tests_left > max_steps + 1 - FROZEN_STEPS
+        tests_left = left_after_test(status, tests_left)
+        refresh = is_first | (~frozen & (tests_left > 0))
         roundoff, in_general = roundoff_pivot_tolerance(rows.dtype), diagonal_shift(rows)
 
-        def factored(rows: Array, directions: Array) -> tuple[Array, ...]:
+        def factors_of(rows: Array, directions: Array) -> tuple[Any, ...]:
             left, right = (DenseRows(x).equilibrated()[1].matrix for x in (rows, directions))
+            matrix = gram_matrix(left, right)
             if not keeps_matrix:
-                least = _pivot_tolerance(level, rows.dtype)
-                return gram_inverse(left, right, pivot_tolerance=least, ordered=True)
-            return gram_inverse(left, right, added=jnp.where(is_late, roundoff, in_general))[:1]
+                least = _pivot_tolerance(status, rows.dtype)
+                return gauss_jordan(matrix, pivot_tolerance=least, ordered=True)
+            return gauss_jordan(matrix, added=jnp.where(frozen, in_general, roundoff))[:1]
 
-        def anew() -> list[Array]:
-            new = [rows, *factored(rows, rows)]
-            return [jnp.where(renewed, a, b) for a, b in zip(new, last, strict=True)]
+        def refreshed() -> list[Array]:
+            new = [rows, *factors_of(rows, rows)]
+            return [jnp.where(refresh, a, b) for a, b in zip(new, previous, strict=True)]
 
         def move() -> list[Array]:
             if keeps_matrix:
-                kept = lax.cond(any_lane(renewed), anew, lambda: last)
-                of_matrix, factors = kept
-                place = given_order(m, lanes)
+                linearisation = lax.cond(any_lane(refresh), refreshed, lambda: previous)
+                of_matrix, factors = linearisation
+                pivot_step = given_order(m, lanes)
             else:
-                kept, of_matrix = [jnp.where(renewed, rows, *last)], rows
-                factors, place = factored(rows, *kept)
+                linearisation, of_matrix = previous, rows
+                if not has_directions:
+                    linearisation = [jnp.where(refresh, rows, *previous)]
+                factors, pivot_step = factors_of(rows, *linearisation)
             row_scales, _ = DenseRows(of_matrix).equilibrated()
-            _, directions = DenseRows(kept[0]).equilibrated()
-            multiplier = gram_solution(factors, place, to_correct / row_scales)
+            _, directions = DenseRows(linearisation[0]).equilibrated()
+            multiplier = gauss_jordan_solution(factors, pivot_step, to_correct / row_scales)
             change = written_out_product(jnp.moveaxis(directions.matrix, 1, 0), multiplier)
-            return [y - each(lambda problem, x: problem.factor.to_state(x))(change), *kept]
+            to_state = map_lanes(lambda given, x: given[0].factor.to_state(x))
+            return [y - to_state(change), *linearisation]
 
         # Alone, for a few constraints, a branch takes longer than what it avoids.
         branch = is_batched or keeps_matrix
@@ -326,13 +259,25 @@ def _with_lanes_last(
 
     candidate = lax.optimization_barrier(candidate)
     n, *lanes = candidate.shape
-    m = jax.eval_shape(each(tested), candidate)[1].shape[0]
-    keeps_matrix = m > MAX_UNROLLED
-    begin = [candidate, jnp.zeros((m, n, *lanes), candidate.dtype)]
+    if has_directions:
+        begin = [candidate, map_lanes(lambda given, y: given[1].matrix)(candidate)]
+    else:
+        begin = [candidate, jnp.zeros((m, n, *lanes), candidate.dtype)]
     if keeps_matrix:
         begin.append(jnp.zeros((m, m, *lanes), np.promote_types(candidate.dtype, np.float32)))
-    found = iterate(advance, begin, max_steps=max_steps, lanes=tuple(lanes))
-    return found._replace(y=found.y[0])
+    solved = iterate(advance, begin, max_steps=max_steps, lanes=tuple(lanes))
+    return solved._replace(y=solved.y[0])
+
+
+def _pivot_tolerance(status: Array, dtype: Any) -> float | Array:
+    """A step that only polishes is as long as roundoff divided by the sine of the angle between
+    gradients. So that it is at most `TOLERANCE_IN_EPS` times as long as with a right angle,
+    constraints with a sine of at most `1 / TOLERANCE_IN_EPS` take no part in it. In float64 it is
+    short in any case, and a batch is faster without the distinction."""
+    roundoff = roundoff_pivot_tolerance(dtype)
+    if dtype == jnp.float64:
+        return roundoff
+    return jnp.where(status < WITHIN_TOLERANCE, roundoff, max(roundoff, 1 / TOLERANCE_IN_EPS**2))
 
 
 @eqx.filter_jit
@@ -348,12 +293,12 @@ def _with_frozen_jacobian(
     candidate = lax.optimization_barrier(candidate)
     jacobian = problem.linearise(candidate)[1]
     scale = problem.scale(jacobian, candidate)
-    row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
+    row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
     solve = rows.gram(rows).factorise()
 
     def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
-        level, to_correct = problem.level(problem.residual(y), scale)
-        tests_left = left_after_test(level, tests_left)
+        status, to_correct = problem.status(problem.residual(y), scale)
+        tests_left = left_after_test(status, tests_left)
 
         def move() -> Array:
             return y - problem.factor.to_state(rows.rmatvec(solve(to_correct / row_scales)))
@@ -397,14 +342,14 @@ def damped_newton(
         y, is_first = now.y, now.largest == jnp.inf
         g, jacobian = lax.optimization_barrier(problem.linearise(y))
         scale_at_y = problem.scale(jacobian, y)
-        level, to_correct = problem.level(g, scale_at_y)
+        status, to_correct = problem.status(g, scale_at_y)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
-        level = jnp.where(is_first, level, jnp.maximum(level, ABOVE_TOLERANCE))
-        tests_left = left_after_test(level, tests_left, polish=polish)
+        status = jnp.where(is_first, status, jnp.maximum(status, ABOVE_TOLERANCE))
+        tests_left = left_after_test(status, tests_left, polish=polish)
         scale = jnp.where(is_first, scale_at_y, now.scale)
         residuals = jnp.abs(relative_to_scale(g, scale))
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
-        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
+        row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
         current = rows if directions is None else directions
         change = rows.gram(current).row_space_correction(current, to_correct / row_scales)
         newton_point = y - problem.factor.to_state(change)
@@ -415,8 +360,8 @@ def damped_newton(
         return _DampedState(moved, best, largest, scale), tests_left
 
     begin = _DampedState(start, start, jnp.full_like(start[0], jnp.inf), problem.magnitude)
-    found = iterate(advance, begin, max_steps=max_steps)
-    return found._replace(y=found.y.y)
+    solved = iterate(advance, begin, max_steps=max_steps)
+    return solved._replace(y=solved.y.y)
 
 
 # ---- Within bounds ----
@@ -435,9 +380,9 @@ def semismooth_newton(
 
     def advance(z: Array, tests_left: Array) -> tuple[Array, Array]:
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
-        level, _ = problem.level(g, problem.scale(jacobian, z))
-        tests_left = left_after_test(level, tests_left, polish=False)
-        row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
+        status, _ = problem.status(g, problem.scale(jacobian, z))
+        tests_left = left_after_test(status, tests_left, polish=False)
+        row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.
         multiplier = rows.gram(directions).solve(g / row_scales)

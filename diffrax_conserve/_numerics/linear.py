@@ -2,16 +2,16 @@
 
 import functools as ft
 import operator as op
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from .._constants import MAX_WRITTEN_OUT, NUM_REFINEMENTS, REGULARISATION_POWER, ROUNDOFF
+from .._constants import MAX_WRITTEN_OUT, NUM_REFINEMENTS, REGULARISATION_POWER, TOLERANCE_IN_EPS
 from .._tree import eps_of
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -59,88 +59,120 @@ def diagonal_shift(matrix: Array) -> float:
     return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
 
 
-def gram_inverse(
-    rows: Float[Array, "m n *lanes"],
-    others: Float[Array, "m n *lanes"],
+def gram_matrix(
+    rows: Float[Array, "m n *lanes"], others: Float[Array, "m n *lanes"]
+) -> Float[Array, "m m *lanes"]:
+    """`U Vᵀ`, for the rows alone or of each lane, in float32 at least."""
+    _, n, *lanes = rows.shape
+    dtype = np.promote_types(rows.dtype, np.float32)
+    rows, others = rows.astype(dtype), others.astype(dtype)
+    if n > MAX_WRITTEN_OUT:
+        return jnp.einsum("ik...,jk...->ij...", rows, others, precision=lax.Precision.HIGHEST)
+    if not lanes:
+        return jnp.sum(rows[:, None] * others[None], axis=2)
+    pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(others, axis=1), strict=True)
+    return ft.reduce(op.add, (x[:, None] * y[None] for x, y in pairs))
+
+
+def gauss_jordan(
+    matrix: Float[Array, "m m *lanes"],
     *,
     added: float | Array = 0.0,
     pivot_tolerance: float | Array = 0.0,
     ordered: bool = False,
-) -> tuple[Float[Array, "m m *lanes"], Int[Array, "m *lanes"]]:
-    """The factors of `U Vᵀ` for `gram_solution`, for the rows alone or of each lane, by Gaussian
-    elimination as in `inverse_factors`, and the place of each row in the order of elimination. If
-    `ordered`, that is the order of `forward_elimination`, and otherwise the given one.
+) -> tuple[Float[Array, "m m *lanes"], Array | np.ndarray]:
+    """The factors of a small Gram matrix for `gauss_jordan_solution`, by Gaussian elimination, and
+    for each row the number of the step in which it was the pivot row.
 
     To each element of the diagonal its share `added` is added, and a pivot of at most its share
-    `pivot_tolerance` counts as infinite. The pivots are on the diagonal of the result, and the
-    inverses of both factors take the places of the elements that were eliminated (Gauss and
-    Jordan). No rows are exchanged: the place of a row that was not yet eliminated is `m`.
+    `pivot_tolerance` counts as infinite, so that its multiplier is zero.
+
+    Divided by the element on the diagonal of the matrix, a pivot is the squared sine of the angle
+    between the gradient of a constraint and the span of the gradients before it. If `ordered`, the
+    next constraint is that with the largest: if a nearly parallel gradient came earlier, its
+    roundoff would be magnified in the pivots of those that could replace it. Otherwise the order is
+    the given one, which `U Uᵀ` allows, and `U Vᵀ` for directions `V` near `U`. No rows are
+    exchanged. LAPACK takes longer for such matrices, and its threads wait for each other on a busy
+    machine.
+
+    The pivots are on the diagonal of the result, and the inverses of both triangular factors take
+    the places of the elements that were eliminated (Gauss and Jordan). We do not multiply the two:
+    where constraints depend on each other, the elements of the inverse are as large as one over
+    what is added to the diagonal, and the roundoff of the product would spoil what the constraints
+    determine.
 
     What is done with an element is one loop over the lanes, and the steps of the elimination are a
     loop too, so that no kernel repeats the steps before it.
     """
-    m, n, *lanes = rows.shape
-    dtype = np.promote_types(rows.dtype, np.float32)
-    rows, others = rows.astype(dtype), others.astype(dtype)
-    if n > MAX_WRITTEN_OUT:
-        matrix = jnp.einsum("ik...,jk...->ij...", rows, others, precision=lax.Precision.HIGHEST)
-    elif not lanes:
-        matrix = jnp.sum(rows[:, None] * others, axis=2)
-    else:
-        pairs = zip(jnp.unstack(rows, axis=1), jnp.unstack(others, axis=1), strict=True)
-        matrix = ft.reduce(op.add, (x[:, None] * y for x, y in pairs))
+    m, _, *lanes = matrix.shape
     j = given_order(m, lanes)
-    i = j[:, None]
-    matrix = jnp.where(i == j, matrix + jnp.asarray(added, dtype) * matrix, matrix)
+    on_diagonal = j[:, None] == j[None]
+    of_lanes = lambda x: jnp.broadcast_to(jnp.asarray(x, matrix.dtype), (1, *lanes))  # noqa: E731
+    added, pivot_tolerance = of_lanes(added), of_lanes(pivot_tolerance)
+    matrix = jnp.where(on_diagonal, matrix + added[None] * matrix, matrix)
     size = jnp.abs(_diagonal(matrix))
-    infinite = lambda pivot, k: jnp.where(jnp.abs(pivot) <= pivot_tolerance * k, jnp.inf, pivot)  # noqa: E731
 
-    def eliminate(k: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
-        matrix, place = now
-        relative_pivot = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
-        next_one = jnp.argmax(jnp.where(place == m, relative_pivot, -1), axis=0) if ordered else k
-        is_k = j == next_one
-        row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0) if ordered else matrix[k]
-        column = jnp.sum(jnp.where(is_k, matrix, 0), axis=1) if ordered else matrix[:, k]
-        pivot = jnp.sum(jnp.where(is_k, row, 0), axis=0)
-        pivot = infinite(pivot, jnp.sum(jnp.where(is_k, size, 0), axis=0))
-        place = jnp.where(is_k, k, place)
+    def pivots_of(matrix: Array) -> Array:
+        pivots = _diagonal(matrix)
+        return jnp.where(jnp.abs(pivots) <= pivot_tolerance * size, jnp.inf, pivots)
+
+    def eliminate(k: Array | int, now: tuple[Array, Any], ordered: bool) -> tuple[Array, Any]:
+        matrix, pivot_step = now
+        is_left = pivot_step == m
+        if ordered:
+            relative_pivot = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
+            relative_pivot = jnp.where(is_left, relative_pivot, -1)
+            is_k = j == jnp.argmax(relative_pivot, axis=0, keepdims=True)
+        else:
+            is_k = j == k
+        row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0)
+        column = jnp.sum(jnp.where(is_k[None], matrix, 0), axis=1)
+        pivot = jnp.sum(jnp.where(is_k, pivots_of(matrix), 0), axis=0, keepdims=True)
         row, column = jnp.where(is_k, 1, row) / pivot, jnp.where(is_k, 1, column)
-        rest = jnp.where(is_k[:, None] | is_k, 0, matrix) - column[:, None] * row
-        left = place == m
-        return jnp.where(left[:, None] | left, rest, matrix), place
+        rest = jnp.where(is_k[:, None] | is_k[None], 0, matrix) - column[:, None] * row[None]
+        is_left = is_left & ~is_k
+        matrix = jnp.where(is_left[:, None] | is_left[None], rest, matrix)
+        return matrix, pivot_step + is_k.astype(int) * (k - m)
 
-    begin = matrix, jnp.full((m, *lanes), m)
-    matrix, place = lax.fori_loop(0, m - 1, eliminate, begin)
-    return jnp.where(i == j, infinite(matrix, size), matrix), place
+    pivot_step = np.full((m, *lanes), m)
+    if m > 1:  # the first quotients of pivots are all one
+        matrix, pivot_step = eliminate(0, (matrix, pivot_step), False)
+    if m > 2:
+        steps = ft.partial(eliminate, ordered=ordered)
+        matrix, pivot_step = lax.fori_loop(1, m - 1, steps, (matrix, pivot_step))
+    return jnp.where(on_diagonal, pivots_of(matrix), matrix), pivot_step
 
 
-def _diagonal(matrix: Array) -> Array:
-    return jnp.stack([matrix[k, k] for k in range(len(matrix))])
+def _diagonal(matrix: Float[Array, "m m *lanes"]) -> Float[Array, "m *lanes"]:
+    order = given_order(len(matrix), matrix.shape[2:])
+    return jnp.sum(jnp.where(order[:, None] == order[None], matrix, 0), axis=0)
 
 
-def gram_solution(
+def gauss_jordan_solution(
     factors: Float[Array, "m m *lanes"],
-    place: Array | np.ndarray,
+    pivot_step: Array | np.ndarray,
     b: Float[Array, "m *lanes"],
 ) -> Array:
-    """`(U Vᵀ)⁻¹ b`, by what `gram_inverse` returns."""
-    later, earlier = place[:, None] > place, place[:, None] < place
+    """`matrix⁻¹ b`, by what `gauss_jordan` returns."""
+    after, before = pivot_step[:, None], pivot_step[None]
     pivots = _diagonal(factors)
-    # XLA does not repeat a quotient in each kernel that uses it, as it does with a product.
+    # XLA does not repeat a quotient in each kernel that uses it, as it does with a product. Where
+    # gradients are nearly parallel, the multipliers are large and cancel, so that all that uses one
+    # must see the same number.
     x = b.astype(factors.dtype)
-    x = (x + written_out_product(jnp.where(later, factors, 0), x)) / pivots
-    return (x + written_out_product(jnp.where(earlier, factors, 0), x)).astype(b.dtype)
+    x = (x + written_out_product(jnp.where(after > before, factors, 0), x)) / pivots
+    return (x + written_out_product(jnp.where(after < before, factors, 0), x)).astype(b.dtype)
 
 
-def given_order(m: int, lanes: list[int]) -> np.ndarray:
-    """The place of each row in the order of elimination, if that is the given one."""
+def given_order(m: int, lanes: Sequence[int]) -> np.ndarray:
+    """The step in which each row is the pivot row, if the order is the given one."""
     return np.arange(m).reshape(m, *[1] * len(lanes))
 
 
 def written_out_product(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
     """`matrix x`, as a sum that is written out, which XLA fuses with what is around it."""
-    return ft.reduce(op.add, (matrix[:, k] * x[k] for k in range(len(x))))
+    columns = zip(jnp.unstack(matrix, axis=1), jnp.unstack(x), strict=True)
+    return ft.reduce(op.add, (column * element[None] for column, element in columns))
 
 
 def iterative_refinement(
@@ -203,4 +235,4 @@ def _exchange(x: list[Any], k: int, i: int, exchanged: Bool[Array, ""]) -> None:
 
 def roundoff_pivot_tolerance(dtype: Any) -> float:
     """The largest share of the diagonal that a pivot can be by roundoff alone."""
-    return ROUNDOFF * eps_of(dtype)
+    return TOLERANCE_IN_EPS * eps_of(dtype)

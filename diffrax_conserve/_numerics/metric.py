@@ -40,12 +40,12 @@ class AbstractFactor(eqx.Module):
     is_dense: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         """`Sᵀ gradient`, for one gradient or for each row of a matrix."""
 
-    def scale_columns(self, rows: Any) -> AbstractRows:
+    def scaled_rows(self, rows: Any) -> AbstractRows:
         """`rows S`, for the rows of a Jacobian."""
-        return DenseRows(self.scale_gradient(rows.matrix))
+        return DenseRows(self.scaled_gradient(rows.matrix))
 
     @abc.abstractmethod
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -64,10 +64,10 @@ class AbstractFactor(eqx.Module):
 class Identity(AbstractFactor):
     """`S = 1`, which costs no product."""
 
-    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         return gradient
 
-    def scale_columns(self, rows: Any) -> AbstractRows:
+    def scaled_rows(self, rows: Any) -> AbstractRows:
         return rows
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -84,10 +84,10 @@ class Diagonal(AbstractFactor):
 
     diagonal: Float[Array, " n"]
 
-    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         return gradient * jnp.broadcast_to(self.diagonal, gradient.shape)
 
-    def scale_columns(self, rows: Any) -> AbstractRows:
+    def scaled_rows(self, rows: Any) -> AbstractRows:
         return rows.scale_columns(self.diagonal)
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -113,9 +113,9 @@ class BlockCholesky(AbstractFactor):
     starts: tuple[int, ...] = eqx.field(static=True)
     is_dense: ClassVar[bool] = True
 
-    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x.T, lower=True).T  # noqa: E731
-        return self._on_blocks(solve, self.diagonal_elsewhere.scale_gradient(gradient))
+        return self._on_blocks(solve, self.diagonal_elsewhere.scaled_gradient(gradient))
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
@@ -173,9 +173,9 @@ class PreferredSubspace(AbstractFactor):
 
         return cls(base_factor, lax.scan(add, jnp.zeros_like(changes), jnp.arange(len(changes)))[0])
 
-    def scale_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
+    def scaled_gradient(self, gradient: Float[Array, "*m n"]) -> Float[Array, "*m n"]:
         return self._damped_complement(
-            self.base_factor.scale_gradient(gradient), _complement_damping(gradient.dtype)
+            self.base_factor.scaled_gradient(gradient), _complement_damping(gradient.dtype)
         )
 
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:

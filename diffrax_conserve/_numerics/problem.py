@@ -26,7 +26,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import NOISE, ROUNDOFF
+from .._constants import NOISE_IN_EPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
 from .._manifold import entry_names, evaluate, is_entry
@@ -36,9 +36,8 @@ from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows
 from .sparse_rows import SparseRows
 
-# The levels of a state: a residual is infinite or NaN; a residual exceeds its tolerance; all are
-# within their tolerances; all are noise. They are ordered such that the level of a state is the
-# minimum over its residuals.
+# The status of a residual: infinite or NaN; beyond its tolerance; within it; noise. That of a state
+# is the least of its residuals.
 NOT_FINITE, ABOVE_TOLERANCE, WITHIN_TOLERANCE, AT_ROUNDOFF = -1, 0, 1, 2
 # The residuals of one entry of a manifold, as a function of the vector of the state.
 Residual = Callable[[Float[Array, " n"]], Float[Array, " k"]]
@@ -108,6 +107,10 @@ class Problem(eqx.Module):
     clip: Callable[[Float[Array, " n"]], Float[Array, " n"]] | None = None
     step: Step | None = None
 
+    @property
+    def num_residuals(self) -> int:
+        return sum(self.sizes)
+
     def state(self, y: Float[Array, " n"]) -> Y:
         """The state of the solve whose numbers are `y`."""
         return unravel(y, self.like)
@@ -138,7 +141,7 @@ class Problem(eqx.Module):
 
     def gradients(self, y: Float[Array, " n"]) -> AbstractRows:
         """`G(y) S`, the gradients in the coordinates in which the metric is Euclidean."""
-        return self.factor.scale_columns(self.linearise(y)[1])
+        return self.factor.scaled_rows(self.linearise(y)[1])
 
     def dense(self) -> "Problem":
         """The same problem, with the Jacobian computed as a dense matrix."""
@@ -151,24 +154,23 @@ class Problem(eqx.Module):
 
     def tolerance(self, scale: Float[Array, " m"]) -> Float[Array, " m"]:
         eps = eps_of(scale)
-        rtol = ROUNDOFF * eps if self.rtol is None else self.rtol
+        rtol = TOLERANCE_IN_EPS * eps if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
 
-    def level(
+    def status(
         self, g: Float[Array, " m"], scale: Float[Array, " m"]
     ) -> tuple[Int[Array, ""], Float[Array, " m"]]:
-        """The level of a state with these residuals and scales, the least over its residuals, from
-        `NOT_FINITE` to `AT_ROUNDOFF`, and the residuals that are to be corrected, with zeros for
-        those that are noise."""
+        """The status of a state with these residuals and scales, and the residuals that are to be
+        corrected, with zeros for those that are noise."""
         limit = self.tolerance(scale)
-        noise = jnp.abs(g) <= NOISE / ROUNDOFF * limit
+        noise = jnp.abs(g) <= NOISE_IN_EPS / TOLERANCE_IN_EPS * limit
         # Where the tolerance underflows, the residual may have underflowed too, and an infinite one
         # would accept any state, so neither counts as met. With a scale of exactly zero only a
         # residual of exactly zero is accepted, unless `atol` is given.
         valid = (limit >= float(jnp.finfo(scale.dtype).tiny)) | (scale == 0)
         met_tolerance = valid & (limit < jnp.inf) & (jnp.abs(g) <= limit)
-        # We take the minimum of the levels, which are integers. A maximum of the residuals would be
+        # The status is a minimum of integers. A maximum of the residuals would be
         # shorter, but on a CPU a maximum can lose a NaN.
         within = jnp.where(noise, jnp.int8(AT_ROUNDOFF), jnp.int8(WITHIN_TOLERANCE))
         beyond = jnp.where(jnp.abs(g) < jnp.inf, jnp.int8(ABOVE_TOLERANCE), jnp.int8(NOT_FINITE))
@@ -177,7 +179,7 @@ class Problem(eqx.Module):
     def is_on_manifold(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
         g, jacobian = self.linearise(y)
-        return self.level(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
+        return self.status(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
 
     def per_residual(self, of_entries: Sequence[Any]) -> np.ndarray:
         """One element for each residual, from one for each entry of the manifold."""
@@ -210,7 +212,7 @@ class Problem(eqx.Module):
         sizes = [jnp.where(jnp.isnan(x), jnp.inf, x) for x in sizes]
         success = ok
         if success is None:
-            success = converged | (problem.level(after, scale)[0] >= WITHIN_TOLERANCE)
+            success = converged | (problem.status(after, scale)[0] >= WITHIN_TOLERANCE)
         before, after = (jnp.max(x) for x in sizes)
         results = optx.RESULTS
         missed, diverged = results.nonlinear_max_steps_reached, results.nonlinear_divergence

@@ -103,7 +103,7 @@ def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _
     closed = jax.make_jaxpr(fn)(y)
 
     def evaluate(y: Array, *sums: Array) -> Array:
-        return _inside(closed, [(y, _STATE)], lambda x, size: _rounded(x, size, *sums))[0][0]
+        return _with_roundoff(closed, [(y, _STATE)], lambda x, size: _rounded(x, size, *sums))[0][0]
 
     value, vjp = jax.vjp(evaluate, y, *jnp.zeros(2, y.dtype))
     one = jnp.eye(value.size, dtype=value.dtype)
@@ -143,7 +143,9 @@ _rounded.defvjp(lambda x, size, total, squares: (x, (size, total)), _adjoint)
 _Pair = tuple[Any, int]  # a value, and how it depends on the state
 
 
-def _inside(closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]) -> list[_Pair]:
+def _with_roundoff(
+    closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]
+) -> list[_Pair]:
     """The values of a jaxpr in which `changed(x, size)` takes the place of each `x` that has an
     error of its own, of one unit of roundoff of `size`."""
     return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, changed))
@@ -158,9 +160,9 @@ def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) 
     # A function with a derivative rule of its own. We look into it, because a rule is about the
     # derivative and not about the errors, unless JAX could not differentiate what is inside.
     if inner is not None and not _is_opaque(inner.jaxpr):
-        return _inside(inner, given, changed)
+        return _with_roundoff(inner, given, changed)
     if name in ("checkpoint", "remat2"):
-        return _inside(closed_jaxpr(params["jaxpr"]), given, changed)
+        return _with_roundoff(closed_jaxpr(params["jaxpr"]), given, changed)
     if name == "cond":
         branches = [ft.partial(_values, changed, branch) for branch in params["branches"]]
         return [(x, kind) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
@@ -187,8 +189,8 @@ def _is_inexact(*xs: Any) -> bool:
 
 
 def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> list[Any]:
-    """As `_inside`, where all inputs may be computed from the state."""
-    return [x for x, _ in _inside(closed, [(x, _COMPUTED) for x in inputs], changed)]
+    """As `_with_roundoff`, where all inputs may be computed from the state."""
+    return [x for x, _ in _with_roundoff(closed, [(x, _COMPUTED) for x in inputs], changed)]
 
 
 def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:

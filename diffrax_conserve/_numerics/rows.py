@@ -39,10 +39,13 @@ from .linear import (
     Solve,
     diagonal_shift,
     forward_elimination,
-    inverse_factors,
+    gauss_jordan,
+    gauss_jordan_solution,
+    given_order,
     iterative_refinement,
     lu_factors,
     lu_solution,
+    roundoff_pivot_tolerance,
 )
 
 Rows = TypeVar("Rows", bound="AbstractRows")
@@ -77,6 +80,10 @@ class AbstractRows(eqx.Module):
     @abc.abstractmethod
     def largest(self) -> Float[Array, "m *lanes"]:
         """The absolute value of the largest element of each row."""
+
+    @abc.abstractmethod
+    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
+        """The absolute value of the largest element of each of `n` columns."""
 
     @abc.abstractmethod
     def apply(self: Rows, linear: Callable[[Array], Array], n: int) -> Rows:
@@ -188,6 +195,10 @@ class DenseRows(AbstractRows):
     def largest(self) -> Float[Array, "m *lanes"]:
         return jnp.max(jnp.abs(self.matrix), axis=1)
 
+    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
+        del n
+        return jnp.max(jnp.abs(self.matrix), axis=0)
+
     def apply(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
         del n
         return DenseRows(jax.vmap(linear)(self.matrix))
@@ -217,11 +228,9 @@ class PivotedGram(_DenseGram):
 
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         del pivot_tolerance
-        matrix, equilibration = _equilibrated(self.matrix)
-        one = jnp.eye(len(matrix), dtype=matrix.dtype)
-        inverse_upper_t, inverse_lower = forward_elimination(matrix, one, one)
-        solve = jtu.Partial(_inverse_product, inverse_lower, inverse_upper_t.T)
-        return _Equilibrated(solve, equilibration, matrix.dtype)
+        tolerance = roundoff_pivot_tolerance(self.matrix.dtype)
+        factors = gauss_jordan(self.matrix, pivot_tolerance=tolerance, ordered=True)
+        return jtu.Partial(gauss_jordan_solution, *factors)
 
     def solve(
         self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None
@@ -252,17 +261,15 @@ class RegularisedGram(_DenseGram):
     """The Gram matrix of more rows."""
 
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
+        added = diagonal_shift(self.matrix) if pivot_tolerance is None else pivot_tolerance
+        if len(self.matrix) <= MAX_BLOCK:
+            factors, _ = gauss_jordan(self.matrix, added=added)
+            return jtu.Partial(gauss_jordan_solution, factors, given_order(len(factors), []))
+        # To invert larger factors takes longer than the few substitutions of a step.
         matrix, equilibration = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
-        added = diagonal_shift(matrix) if pivot_tolerance is None else pivot_tolerance
-        one = jnp.eye(len(matrix), dtype=dtype)
-        matrix = matrix.astype(dtype) + added * one
-        if len(matrix) > MAX_BLOCK:
-            # To invert larger factors takes longer than the few substitutions of a step.
-            return _Equilibrated(jtu.Partial(lu_solution, lu_factors(matrix)), equilibration, dtype)
-        return _Equilibrated(
-            jtu.Partial(_inverse_product, *inverse_factors(matrix)), equilibration, dtype
-        )
+        matrix = matrix.astype(dtype) + added * jnp.eye(len(matrix), dtype=dtype)
+        return _Equilibrated(jtu.Partial(lu_solution, lu_factors(matrix)), equilibration, dtype)
 
 
 class _Equilibrated(eqx.Module):
@@ -275,11 +282,6 @@ class _Equilibrated(eqx.Module):
     def __call__(self, b: Float[Array, " m"]) -> Float[Array, " m"]:
         x = self.solve((b * self.equilibration).astype(self.dtype))
         return x.astype(b.dtype) * self.equilibration
-
-
-def _inverse_product(left: Array, right: Array, b: Array) -> Array:
-    """`right (left b)`, two products that XLA fuses with what is around them."""
-    return _transposed_product(_transposed_product(b, left.T), right.T)
 
 
 def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:

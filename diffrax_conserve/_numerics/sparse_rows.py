@@ -57,6 +57,10 @@ class SparseRows(AbstractRows):
         largest = jnp.max(jnp.abs(take(self.colours, self.pattern.elements)), axis=2)
         return self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
 
+    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
+        dense = jnp.max(jnp.abs(self.dense), axis=0, initial=0)
+        return dense.at[self.pattern.active].max(jnp.max(jnp.abs(self.colours), axis=0))
+
     def divide_rows(self, row_scales: Float[Array, " m"]) -> "SparseRows":
         owned = self.pattern.owners < len(self)
         size = jnp.where(owned, take(row_scales, self.pattern.owners), 1)

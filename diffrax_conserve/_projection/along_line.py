@@ -89,7 +89,7 @@ class AlongLine(AbstractProjection):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        size = problem.magnitude.size
+        size = problem.num_residuals
         if size != 1:
             raise ValueError(
                 f"`AlongLine` has one unknown, but `manifold` has {size} scalar constraints. Keep "

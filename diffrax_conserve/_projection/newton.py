@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_DENSE_SYSTEM, ROUNDOFF
+from .._constants import MAX_DENSE_SYSTEM, TOLERANCE_IN_EPS
 from .._numerics.implicit import nan_tangent_unless, root
 from .._numerics.iterate import Solved, damped_newton
 from .._numerics.metric import Identity
@@ -77,7 +77,7 @@ class Newton(AbstractNewton):
         # Nobody uses the derivative of the first phase: that of the nearest point is by the second
         # one, and elsewhere it is NaN.
         first_phase = ft.partial(along_gradients, max_steps=self.max_steps, iteration=damped_newton)
-        if candidate.size + problem.magnitude.size > MAX_DENSE_SYSTEM:
+        if candidate.size + problem.num_residuals > MAX_DENSE_SYSTEM:
             first = first_phase(*start)
             y, more = nan_tangent_unless(given.clip(first.y), False), 0
         else:
@@ -122,7 +122,7 @@ class _Conditions(eqx.Module):
         change, multiplier = jnp.split(unknowns, [self.base.size])
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
-        gradient = problem.factor.scale_gradient(vjp(multiplier / self.row_norms)[0])
+        gradient = problem.factor.scaled_gradient(vjp(multiplier / self.row_norms)[0])
         return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
 
 
@@ -131,7 +131,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     conditions as equations with their scales and tolerances."""
     problem, y = given.problem, given.clip(base)
     jacobian = problem.linearise(y)[1]
-    row_norms, rows = problem.factor.scale_columns(jacobian).normalised()
+    row_norms, rows = problem.factor.scaled_rows(jacobian).normalised()
     conditions = _Conditions(given, base, row_norms)
     sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
     change = problem.factor.to_metric(base - given.candidate)
@@ -150,7 +150,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
         cancellation=jnp.concatenate([jnp.zeros_like(y), problem.cancellation]),
         changes=None,
         factor=Identity(),
-        rtol=tolerance(ROUNDOFF * eps_of(y), problem.rtol),
+        rtol=tolerance(TOLERANCE_IN_EPS * eps_of(y), problem.rtol),
         atol=tolerance(0.0, problem.atol),
     )
     return (
@@ -169,10 +169,10 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     def approach(now: Any) -> Any:
         base, _, count, left = now
         _, start, tested = _conditions(still, base)
-        found = damped_newton(tested, start, max_steps=max_steps, polish=True)
-        end = base + still.problem.factor.to_state(found.y[: base.size])
-        left = jnp.where(found.ok, left - 1, 0)
-        return jnp.where(found.ok, end, base), found.ok, count + found.num_iterations, left
+        solved = damped_newton(tested, start, max_steps=max_steps, polish=True)
+        end = base + still.problem.factor.to_state(solved.y[: base.size])
+        left = jnp.where(solved.ok, left - 1, 0)
+        return jnp.where(solved.ok, end, base), solved.ok, count + solved.num_iterations, left
 
     # The change from the first base may be so large that its roundoff exceeds that of the result.
     # So we start once more, with the result as the base: now the change itself is roundoff.
@@ -181,8 +181,8 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     ok = ok & still.problem.is_on_manifold(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
-    found = root(
+    solved = root(
         conditions, lambda x: Solved(x, ok, count), start, ft.partial(solve_kkt, first.size)
     )
-    y = conditions.state(found.y)
+    y = conditions.state(solved.y)
     return nan_tangent_unless(y, ok | ~still.problem.is_on_manifold(lax.stop_gradient(y))), count

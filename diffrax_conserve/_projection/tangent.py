@@ -158,8 +158,8 @@ class TangentField(eqx.Module):
             problem = dataclasses.replace(problem, factor=factor_of(self.metric, t, y, args))
         evaluated = lambda t, y: ravel(evaluate(self.manifold, t, y, args))  # noqa: E731
         t = jnp.asarray(t, jnp.result_type(float, t))
-        found, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
-        wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (found - numbers)
+        value, along = jax.jvp(evaluated, (t, y), (jnp.ones_like(t), slope))
+        wanted = ravel(rates(self.manifold, t, y, args)) - self.gain * (value - numbers)
         to_correct = (wanted - along).astype(vector.dtype)
 
         def solved(given: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -167,7 +167,7 @@ class TangentField(eqx.Module):
             their scales, and so is the right side."""
             vector, to_correct = given
             _, jacobian = problem.linearise(vector)
-            row_scales, rows = problem.factor.scale_columns(jacobian).equilibrated()
+            row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
             gram, right = rows.gram(rows), to_correct / row_scales
             change = problem.factor.to_state(gram.row_space_correction(rows, right))
             return change, gram.solve(right) / row_scales

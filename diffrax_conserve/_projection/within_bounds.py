@@ -81,7 +81,7 @@ def along_gradients(
         return implicit_solution(
             MultiplierSystem(problem, candidate, iteration=iteration, max_steps=max_steps)
         )
-    rows = problem.factor.scale_columns(problem.linearise(candidate)[1])
+    rows = problem.factor.scaled_rows(problem.linearise(candidate)[1])
     functions = tuple(eqx.Partial(_clipped, bounds, fn) for fn in problem.functions)
     within = dataclasses.replace(problem, functions=functions, clip=bounds.clip)
     return implicit_solution(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from .._constants import ROUNDOFF
+from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import BoolScalarLike, Manifold, RealScalarLike
 from .._manifold import Constraint, is_entry
 from .._numerics.problem import Problem
@@ -111,8 +111,8 @@ def is_shortest_step(
     time itself and the length of the first step. The time alone would not do in a solve from zero.
     """
     size = jnp.abs(candidate)
-    at_rest = jnp.all(change <= ROUNDOFF * eps_of(size) * size)
-    return at_rest | (jnp.abs(length) <= ROUNDOFF * eps_of(length) * time)
+    at_rest = jnp.all(change <= TOLERANCE_IN_EPS * eps_of(size) * size)
+    return at_rest | (jnp.abs(length) <= TOLERANCE_IN_EPS * eps_of(length) * time)
 
 
 def masked_step(

@@ -34,7 +34,7 @@ from .failure import (
 )
 from .state import State, StepEnd, initial_values, updated_units
 from .statistics import ProjectionStatistics
-from .target import Path, Target
+from .target import Path, TargetManifold
 from .terms import (
     check_direction,
     check_projects_nothing,
@@ -306,7 +306,7 @@ class ManifoldProjection(ForwardingSolver):
         wrapped: "_WrappedStep",
         like: Any,
         args: Args,
-    ) -> tuple[State, Target]:
+    ) -> tuple[State, TargetManifold]:
         """The solver state with the units and displacements of this step, and the target at the
         start of the step.
 
@@ -319,7 +319,7 @@ class ManifoldProjection(ForwardingSolver):
         if displacements is not None:
             new = displacements_along(wrapped.path, step)
             displacements = jnp.concatenate([new, displacements[:_NUM_DISPLACEMENTS]])
-        target = Target(
+        target = TargetManifold(
             self.projection,
             self.manifold,
             like,
@@ -336,7 +336,7 @@ class ManifoldProjection(ForwardingSolver):
 
     def _failure(
         self,
-        target: Target,
+        target: TargetManifold,
         state: State,
         wrapped: "_WrappedStep",
         metric: AbstractFactor,
@@ -367,7 +367,7 @@ class ManifoldProjection(ForwardingSolver):
         ), is_final
 
     def _cannot_start(
-        self, target: Target, state: State, step: Step, made_jump: BoolScalarLike
+        self, target: TargetManifold, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off the manifold. The second is
         tested at the start of a solve, also of one that goes on, and after a jump of the vector
@@ -397,8 +397,8 @@ def first_displacements(
     control = terms.contr(t0, t1)
     first = terms.vf_prod(t0, y0, args, control)
     second = terms.vf_prod(t1, tree_add(y0, first), args, control)
-    found = jnp.stack([ravel(first), ravel(second)])
-    return changes.at[:2].set(jnp.where(jnp.isfinite(found), found, 0))
+    displacements = jnp.stack([ravel(first), ravel(second)])
+    return changes.at[:2].set(jnp.where(jnp.isfinite(displacements), displacements, 0))
 
 
 class _WrappedStep(NamedTuple):

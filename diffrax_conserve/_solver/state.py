@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import ROUNDOFF
+from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._hashable import hash_of
 from .._manifold import conserved_values
@@ -26,14 +26,15 @@ class State(eqx.Module):
     """What later steps need.
 
     - `inner`: the state of the wrapped solver.
-    - `packed_constants`: `values` and `cancellation` as in a `Target`, and `first_step_size`, the
-      length of the first step that was tried, a scale of the times of the solve. They are one
-      array, because in a gradient each array of the state is saved and restored.
-    - `rate_integrals`: as in a `Target`.
+    - `packed_constants`: `values` and `cancellation` as in a `TargetManifold`, and
+      `first_step_size`, the length of the first step that was tried, a scale of the times of the
+      solve. They are one array, because in a gradient each array of the state is saved and
+      restored.
+    - `rate_integrals`: as in a `TargetManifold`.
     - `units`: the unit of each component in the metric of motion, see `updated_units`, the largest
       of all steps so far; zero before the first step.
     - `last_end`: the end of the last step.
-    - `displacements`: those in the last two steps, as in a `Target`; `None` unless linear
+    - `displacements`: those in the last two steps, as in a `TargetManifold`; `None` unless linear
       invariants are kept.
     """
 
@@ -90,7 +91,7 @@ class StepEnd(eqx.Module):
         if self.manifold_hash != hash_of(manifold):
             return jnp.asarray(True)
         sums, sizes = self._checksums(t, y, args, manifold)
-        return jnp.any(jnp.abs(sums - self.checksums) > ROUNDOFF * eps_of(y) * sizes)
+        return jnp.any(jnp.abs(sums - self.checksums) > TOLERANCE_IN_EPS * eps_of(y) * sizes)
 
     def _checksums(
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold

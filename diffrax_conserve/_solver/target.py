@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._balance import integrated_rates
-from .._constants import NOISE, ROUNDOFF
+from .._constants import NOISE_IN_EPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._numerics.metric import AbstractFactor, PreferredSubspace, factor_of
 from .._numerics.problem import Problem, Step, problem_of
@@ -20,7 +20,7 @@ from .._tree import ravel, tree_stop_gradient, unravel
 Path = Callable[[RealScalarLike], Float[Array, " n"]]
 
 
-class Target(eqx.Module):
+class TargetManifold(eqx.Module):
     """Everything that a projection needs except the time, the candidate and the step. Within a step
     only `rate_integrals` depends on the time, see `add_rates`, so that dense output uses the same
     target. Times are those of the vector field, and states are vectors.
@@ -49,7 +49,7 @@ class Target(eqx.Module):
     rate_integrals: Float[Array, "2 m"] | None
     displacements: Float[Array, "k n"] | None
 
-    def add_rates(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "Target":
+    def add_rates(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "TargetManifold":
         """The target at a time `end` in a step, given the `path` of the solution from `start`.
 
         The integral over the step is added to the integrals so far by compensated summation (W.
@@ -61,7 +61,7 @@ class Target(eqx.Module):
         states = lambda t: unravel(path(t), self.like)  # noqa: E731
         return self._plus(ravel(integrated_rates(self.manifold, start, end, states, self.args)))
 
-    def _plus(self, increment: Float[Array, " m"]) -> "Target":
+    def _plus(self, increment: Float[Array, " m"]) -> "TargetManifold":
         assert self.rate_integrals is not None
         last, compensation = self.rate_integrals
         increment = increment.astype(last.dtype) - compensation
@@ -70,7 +70,7 @@ class Target(eqx.Module):
             self, rate_integrals=jnp.stack([total, (total - last) - increment])
         )
 
-    def balanced(self, t: RealScalarLike, y: Float[Array, " n"]) -> "Target":
+    def balanced(self, t: RealScalarLike, y: Float[Array, " n"]) -> "TargetManifold":
         """The target with balances that hold at a state `y`, the start of a step, up to half of
         what counts as noise.
 
@@ -83,7 +83,9 @@ class Target(eqx.Module):
             return self
         problem, y = tree_stop_gradient((self.problem(t, y), y))
         residual, jacobian = problem.linearise(y)
-        half_noise = NOISE / ROUNDOFF * problem.tolerance(problem.scale(jacobian, y)) / 2
+        half_noise = (
+            NOISE_IN_EPS / TOLERANCE_IN_EPS * problem.tolerance(problem.scale(jacobian, y)) / 2
+        )
         follow = residual - jnp.clip(residual, -half_noise, half_noise)
         goes_on = (self.rate_integrals[0] != 0) & jnp.isfinite(residual)
         return self._plus(jnp.where(goes_on, follow, 0))

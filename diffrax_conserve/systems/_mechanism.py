@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 from scipy.optimize import linprog
 
-from .._constants import MAX_STEPS, ROUNDOFF
+from .._constants import MAX_STEPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
@@ -197,7 +197,7 @@ Rows = tuple[tuple[int, ...], ...]
 def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
     """The state `max(y, 0) exp(Wᵀ μ)` with the balances `target`, by Newton's method for `μ`."""
     y, weights = jnp.maximum(y, 0), jnp.asarray(rows, y.dtype)
-    small = ROUNDOFF * jnp.finfo(y.dtype).eps
+    small = TOLERANCE_IN_EPS * jnp.finfo(y.dtype).eps
 
     def state(multiplier: Array) -> State:
         return y * jnp.exp(jnp.sum(multiplier[:, None] * weights, axis=0))

@@ -298,8 +298,8 @@ def of(pair=terms(fall), solver=THREE, velocities=0):
     return lambda: dfx.diffeqsolve(pair, solver, 0.0, 1.0, 0.1, (q, v[velocities:]))
 
 
-NOISE = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
-NOISY = TERMS[0], dfx.ControlTerm(lambda t, q, args: jnp.ones_like(q), NOISE)
+NOISE_IN_EPS = dfx.VirtualBrownianTree(0.0, 1.0, 1e-3, (), jax.random.key(0))
+NOISY = TERMS[0], dfx.ControlTerm(lambda t, q, args: jnp.ones_like(q), NOISE_IN_EPS)
 test_mistakes_are_named = refused(
     (lambda: dfc.RATTLE(dfc.FirstIntegral(rods), 1.0), TypeError, "positions"),
     *((lambda x=x: dfc.RATTLE(dfc.Constraint(rods), x), "masses") for x in ("one", -1.0, 0.0)),

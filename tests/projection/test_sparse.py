@@ -74,7 +74,7 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     x, multiplier = jr.normal(key[3], (y.size,), dtype), jr.normal(key[4], values.shape, dtype)
 
     def rows(problem: Problem, y: Array) -> Any:
-        return problem.factor.scale_columns(problem.linearise(y.reshape(-1))[1])
+        return problem.factor.scaled_rows(problem.linearise(y.reshape(-1))[1])
 
     @jax.jit
     def found() -> Any:

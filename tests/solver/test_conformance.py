@@ -70,11 +70,11 @@ ADDITIVE = sde(
     lambda t, y, args: -jnp.sin(y[0]) * jnp.ones(2), lambda t, y, args: 0.3 * jnp.ones(2)
 )
 DIFFERENCE = dfc.FirstIntegral(lambda t, y, args: jnp.exp(y[0] - y[1]))
-NOISE = brownian((2,), dfx.SpaceTimeTimeLevyArea)
+NOISE_IN_EPS = brownian((2,), dfx.SpaceTimeTimeLevyArea)
 # A thermal bead on a circle: the position is constrained.
 LANGEVIN = dfx.MultiTerm(
     dfx.UnderdampedLangevinDriftTerm(jnp.ones(2), jnp.ones(2), lambda x, args: x),
-    dfx.UnderdampedLangevinDiffusionTerm(jnp.ones(2), jnp.ones(2), NOISE),
+    dfx.UnderdampedLangevinDiffusionTerm(jnp.ones(2), jnp.ones(2), NOISE_IN_EPS),
 )
 CIRCLE = dfc.Constraint(lambda t, y, args: jnp.sum(y[0] ** 2) - 1)
 BODY = kinds.EXPLICIT, kinds.IMPLICIT, kinds.MULTISTEP, kinds.WRAPPER

@@ -1,5 +1,7 @@
 """Index-1 equations: solutions that are known, and another form of the same equations."""
 
+import dataclasses
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -9,6 +11,8 @@ import optimistix as optx
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._numerics.metric import Diagonal
+from diffrax_conserve._numerics.problem import problem_of
 
 from ..problems import EPS, assert_lanes, difference, largest, refused
 from ..thinned import some_of
@@ -301,3 +305,31 @@ test_mistakes_are_named = refused(
     # The pair is taken as its parts.
     (lambda: PAIRED.report((X[0], X[0])), ValueError, "`f` returns .* like `x`"),
 )
+
+
+@pytest.mark.parametrize("k", [1, 3, 60])
+def test_the_derivative_of_forces_does_not_depend_on_their_sizes(k):
+    """A fluid in a row of `k + 1` pipes, whose pressures hold its speeds together. In a step the
+    sizes of unknowns are those of their motion, which for pressures may have any ratios. With `D`
+    for the differences, `D (a s - Dᵀ p) = 0`, so that `∂p/∂a = (D Dᵀ)⁻¹ D s`."""
+    differences = np.eye(k + 1)[:k] - np.eye(k + 1)[1:]
+    push, n = np.sin(np.arange(k + 1.0)), 2 * k + 1
+
+    def f(t, y, a):
+        speed, pressure = y[: k + 1], y[k + 1 :]
+        force = a * push - jnp.pad(pressure, (0, 1)) + jnp.pad(pressure, (1, 0))
+        return jnp.concatenate([force - speed**2 / 10, speed[:-1] - speed[1:]])
+
+    dae = dfc.DAE(f, mass=np.diag(np.r_[np.ones(k + 1), np.zeros(k)]))
+    solver, y0 = dae.wrap(dfc.Radau()), dae.consistent(jnp.ones(n), args=1.0)
+    sizes = 10.0 ** np.r_[np.zeros(k + 1), np.random.default_rng(0).uniform(-8, 0, k)]
+
+    def projected(a):
+        problem = problem_of(solver.manifold, jnp.zeros(2 * k), 0.0, y0, a)
+        problem = dataclasses.replace(problem, factor=Diagonal(jnp.asarray(sizes)))
+        return solver.projection.solve(problem, y0)[0]
+
+    _, tangent = jax.jit(lambda a: jax.jvp(projected, (a,), (1.0,)))(1.0)
+    exact = np.linalg.solve(differences @ differences.T, differences @ push)
+    np.testing.assert_allclose(tangent[k + 1 :], exact, rtol=0, atol=1e-9 * np.max(abs(exact)))
+    np.testing.assert_allclose(tangent[: k + 1], 0, atol=1e-9)

@@ -322,9 +322,23 @@ def test_a_stochastic_term_of_ones_own_class_changes_nothing():
     np.testing.assert_array_equal(solved(term), solved(OwnTerm(term)))
 
 
-def test_strict_promotion_and_rank_promotion():
+@pytest.mark.parametrize(("m", "dtype"), [(1, "float64"), (3, "float32"), (6, "float64")])
+def test_strict_promotion_and_rank_promotion(m, dtype):
+    """Alone and in a batch, for each way in which few constraints are solved."""
+
+    def squares(t, y, args):
+        return jnp.sum(y**2)[None] * jnp.arange(1.0, m + 1, dtype=y.dtype)
+
+    def end(omega):
+        solver = dfc.ManifoldProjection(dfx.Heun(), dfc.FirstIntegral(squares))
+        return jnp.sum(solve(oscillator, solver, jnp.stack([omega, omega])).ys)
+
+    def total(omega):
+        return end(omega[0]) + jnp.sum(jax.vmap(end)(omega))
+
     with jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise"):
         assert jax.eval_shape(jax.grad(sum_of_saved), OMEGA0).shape == OMEGA0.shape
+        assert jax.eval_shape(jax.grad(total), jnp.ones(2, dtype)).shape == (2,)
 
 
 @pytest.mark.slow
