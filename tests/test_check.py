@@ -30,6 +30,14 @@ def test_it_finds_misprints_of_the_paper(name, printed):
         assert entry.ok or entry.defect > 1e-2
 
 
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16, jnp.float32])
+def test_no_precision_takes_a_wrong_integral_for_conserved(dtype):
+    laws = [lambda t, y, args: y @ y, lambda t, y, args: 2 * y[0] + y[1]]
+    turn, ys = lambda t, y, args: jnp.stack([y[1], -y[0]]), jr.normal(jr.key(0), (5, 2), dtype)
+    report = check_invariance(turn, [*map(dfc.FirstIntegral, laws)], ys)
+    assert [entry.ok for entry in report.entries] == [True, False]
+
+
 def test_the_defect_is_relative_to_the_size_of_the_terms():
     """dI/dt = y₁ y₂ (1 + c), of which the terms have the sizes |y₁ y₂| and |c y₁ y₂|."""
     integral = dfc.FirstIntegral(lambda t, y, args: (y[0] ** 2 + y[1] ** 2) / 2)

@@ -31,7 +31,7 @@ from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_function
 from .._projection.base import AbstractProjection, check_projection, with_options
-from .._projection.options import check_state
+from .._projection.options import check_state, refuse_half_precision
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
@@ -363,6 +363,7 @@ class DAE(Hashable):
             raise ValueError(f"Pass {names}: {wanted} positional arguments, not {len(guess)}.")
         y = jtu.tree_map(jnp.asarray, guess[0] if wanted == 1 else guess)
         check_state(y, "a `DAE`", kind=jnp.inexact)
+        refuse_half_precision("A `DAE`", y)
         return y
 
     def _values(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> dict[str, Any]:

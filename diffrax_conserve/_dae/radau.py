@@ -17,7 +17,7 @@ from .._hashable import Hashable
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved, iterate, left_after_step, where_active
 from .._options import check_counts
-from .._projection.options import check_state, option
+from .._projection.options import check_state, option, refuse_half_precision
 from .._solver.terms import in_field_time, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, unravel
@@ -133,6 +133,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         if self._equations is not None:
             self._equations.check(vector_fields(terms))
         check_state(y0, kind=jnp.inexact)
+        refuse_half_precision("`Radau`", y0)
         y = ravel(y0)
         return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
 

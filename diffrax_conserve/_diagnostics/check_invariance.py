@@ -40,8 +40,8 @@ Entry = FirstIntegral | Constraint
 
 # By default a defect of this many units of roundoff counts as roundoff. The number is a choice: the
 # roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
-# order one at almost every state.
-_ROUNDOFF = 1e4
+# order one at almost every state. In half precision a tenth of that is less.
+_ROUNDOFF, _LEAST_DEFECT = 1e4, 0.1
 # The distance to another state at which a derivative is looked at too, as a share of each
 # component.
 _BESIDE = 0.1
@@ -134,7 +134,8 @@ def check_invariance(
         the default, a derivative that is missing may be zero.
     - `args`: passed to `vector_field` and to the functions of the manifold.
     - `key`, `num_states`: the seed (default: `jax.random.key(0)`) and the number of sampled states.
-    - `rtol`: the largest defect that counts as roundoff. Default: 10,000 machine epsilons.
+    - `rtol`: the largest defect that counts as roundoff. Default: 10,000 machine epsilons, at
+        most 0.1.
 
     **Returns:**
 
@@ -168,7 +169,7 @@ def check_invariance(
     check_vector_field(vector_field)
     ts, ys = batch(t, states, jr.key(0) if key is None else key, num_states)
     if rtol is None:
-        rtol = _ROUNDOFF * eps_of(ts)
+        rtol = min(_ROUNDOFF * eps_of(ts), _LEAST_DEFECT)
     with one_of(ys):
         found = _measure(vector_field, manifold, ts, ys, args)
         one_time = np.all(ts == ts[0])

@@ -14,7 +14,7 @@ from .._hashable import Hashable
 from .._numerics.implicit import root
 from .._numerics.iterate import Solved
 from .._options import check_counts
-from .._projection.options import option
+from .._projection.options import option, refuse_half_precision
 from .._tree import eps_of, ravel, tree_stop_gradient, unravel
 
 
@@ -65,7 +65,8 @@ class ImplicitMidpoint(Hashable, dfx.AbstractSolver[None]):
     def init(
         self, terms: dfx.AbstractTerm, t0: RealScalarLike, t1: RealScalarLike, y0: Y, args: Args
     ) -> None:
-        del terms, t0, t1, y0, args
+        del terms, t0, t1, args
+        refuse_half_precision("`ImplicitMidpoint`", y0)
 
     def step(
         self,

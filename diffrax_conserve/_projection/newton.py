@@ -14,7 +14,6 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._constants import MAX_DENSE_SYSTEM, TOLERANCE_IN_EPS
@@ -25,7 +24,7 @@ from .._numerics.problem import Problem
 from .._numerics.report import ProjectionInfo
 from .._numerics.rows import solve_kkt
 from .._tree import eps_of, tree_stop_gradient
-from .options import NEWTON_OPTIONS
+from .options import NEWTON_OPTIONS, refuse_half_precision
 from .within_bounds import AbstractNewton, Bounds, along_gradients
 
 
@@ -66,12 +65,7 @@ class Newton(AbstractNewton):
     def solve(
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
-        if np.promote_types(candidate.dtype, np.float32) != candidate.dtype:
-            # LAPACK has no half precision, in which the derivative would need singular values.
-            raise TypeError(
-                f"`Newton` cannot solve in the dtype of the state, {candidate.dtype}. Convert the "
-                "state to float32, or pass `projection=SimplifiedNewton()`."
-            )
+        refuse_half_precision("`Newton`", candidate, ", or pass `projection=SimplifiedNewton()`")
         bounds = self.bounds(problem.like)
         given, start = _Given(problem.dense(), candidate, bounds), (bounds, problem, candidate)
         # Nobody uses the derivative of the first phase: that of the nearest point is by the second

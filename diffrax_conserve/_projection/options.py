@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 
 from .._custom_types import Y
 from .._options import check_counts, check_number, dtype_of
@@ -50,6 +51,16 @@ NEWTON_OPTIONS = r"""**Arguments:**
 less than 1, a weight is not positive, a lower bound is above its upper bound, or, in use, the
 weights or bounds are not shaped like the state.
 """
+
+
+def refuse_half_precision(user: str, y: Y, remedy: str = "") -> None:
+    """Raises if a leaf of the state has half precision, which LAPACK does not have."""
+    for dtype in (jnp.finfo(dtype_of(x)).dtype for x in jtu.tree_leaves(y)):
+        if np.promote_types(dtype, np.float32) != dtype:
+            raise TypeError(
+                f"{user} cannot solve linear systems in the dtype of the state, {dtype}. Convert "
+                f"the state to float32{remedy}."
+            )
 
 
 def check_state(y: Y, user: str = "a projection", kind: Any = jnp.floating) -> None:

@@ -184,6 +184,16 @@ def test_it_works_in_half_precision(name, dtype):
     np.testing.assert_allclose(squares, 1.25, rtol=0, atol=limit)
 
 
+def from_half_precision(solver):
+    term, y0 = dfx.ODETerm(oscillator), jnp.array([1.0, 0.5], jnp.float16)
+    return solver.init(term, jnp.float16(0), jnp.float16(0.125), y0, None)
+
+
+def consistent_in_half_precision():
+    dae = dfc.DAE(lambda t, x, z, args: -z, algebraic=lambda t, x, z, args: z - x)
+    return dae.consistent(jnp.float16(1), jnp.float16(0.5))
+
+
 test_mistakes_are_named = refused(
     (lambda: formula(closed_forms.density_matrix())(jnp.ones((2, 3))), ValueError, "no square"),
     (lambda: formula(closed_forms.rotation_matrix())(jnp.eye(2) + 0j), TypeError, "is real"),
@@ -193,4 +203,9 @@ test_mistakes_are_named = refused(
         for fn in (lambda t, y, args, values: (y,), lambda t, y, args, values: y[:1])
     ),
     (lambda: in_half_precision(dfc.Newton(), jnp.float16), TypeError, "the state to float32"),
+    *(
+        (lambda solver=solver: from_half_precision(solver), TypeError, "the state to float32")
+        for solver in (dfc.ImplicitMidpoint(), dfc.RandomFeatureSolver(), dfc.Radau())
+    ),
+    (consistent_in_half_precision, TypeError, "A `DAE` cannot solve .* float16"),
 )

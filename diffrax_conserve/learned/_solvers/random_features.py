@@ -21,7 +21,7 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._hashable import Hashable
 from ..._numerics.implicit import root
 from ..._numerics.iterate import Solved, iterate, left_after_step, where_active
-from ..._projection.options import check_state
+from ..._projection.options import check_state, refuse_half_precision
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
 from .collocation import ChebyshevInterpolation, increment, multiply
@@ -107,6 +107,7 @@ class RandomFeatureSolver(Hashable, dfx.AbstractSolver[None]):
                 "`diffrax.ODETerm`, or for a stochastic equation another solver: `diffrax.Heun()`."
             )
         check_state(y0, "`RandomFeatureSolver`")
+        refuse_half_precision("`RandomFeatureSolver`", y0)
 
     def step(
         self,
