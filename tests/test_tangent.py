@@ -179,3 +179,33 @@ test_mistakes_with_bounds_are_named = refused(
     (lambda: SEEN(0.0, jnp.ones(2), None), ValueError, "`lower` has the structure"),
     (lambda: SEEN(0.0, (1, 1), None), TypeError, "floating-point"),
 )
+
+
+@pytest.mark.parametrize("k", [8, 10, 40])
+def test_a_chain_at_rest_is_pushed_at_its_end(k):
+    """Its links form stairs, so that the others move by the roundoff of the one before, down to
+    numbers that underflow. State and derivative are those of a plain solve up to its tolerance."""
+    corners = np.stack([(np.arange(k) + 2) // 2, (np.arange(k) + 1) // 2], 1)
+
+    def lengths(t, y, push):
+        return jnp.sum(jnp.diff(y[0], axis=0, prepend=0.0) ** 2, axis=1) - 1
+
+    def free(t, y, push):
+        return y[1], jnp.zeros((k, 2)).at[-1, 1].set(push)
+
+    links = dfc.Constraint(lengths)
+    field = dfc.tangent(free, links.derivative(free), metric=(jnp.inf, 1.0))
+    kept = dfc.ManifoldProjection(dfx.Tsit5(), (links, links.derivative(free)))
+
+    def end(solver, push):
+        y0 = jnp.asarray(corners, float), jnp.zeros((k, 2))
+        steps = dfx.PIDController(rtol=1e-7, atol=1e-9)
+        options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode(), max_steps=128)
+        return dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 0.1, 1e-3, y0, push, **options).ys
+
+    both = [
+        jax.jit(lambda push, solver=solver: jax.jvp(lambda x: end(solver, x), (push,), (1.0,)))(1.0)
+        for solver in (dfx.Tsit5(), kept)
+    ]
+    for plain, projected in zip(*map(jax.tree.leaves, both), strict=True):
+        np.testing.assert_allclose(projected, plain, rtol=0, atol=1e-6 * np.max(np.abs(plain)))

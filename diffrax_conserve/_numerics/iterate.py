@@ -85,7 +85,9 @@ class Solved(NamedTuple):
 # ---- The loop ----
 
 
-def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] = ()) -> Solved:
+def iterate(
+    advance: Advance, y: Any, *, max_steps: int | Array, lanes: tuple[int, ...] = ()
+) -> Solved:
     """Advances the unknowns until no test is left.
 
     `tests_left` is the number of tests that are left. The unknowns are tested before each step and
@@ -101,16 +103,14 @@ def iterate(advance: Advance, y: Any, *, max_steps: int, lanes: tuple[int, ...] 
         y, tests_left = advance(*now[:2])
         return y, tests_left, now[2] + (tests_left > 0).astype(int)
 
-    # The carry is small, because for small systems moving it costs more than the arithmetic.
-    tests_left = jnp.broadcast_to(initial_tests(max_steps), lanes)
+    tests_left = jnp.asarray(max_steps + 1)
+    if isinstance(max_steps, int):
+        # The carry is small, because for small systems moving it costs more than the arithmetic.
+        tests_left = tests_left.astype(np.min_scalar_type(-max_steps - 2))
+    tests_left = jnp.broadcast_to(tests_left, lanes)
     begin = y, tests_left, jnp.zeros(lanes, int)
     y, tests_left, count = lax.while_loop(lambda now: any_lane(now[1] > 0), body, begin)
     return Solved(y, tests_left == 0, count)
-
-
-def initial_tests(max_steps: int) -> Int[Array, ""]:
-    """The number of tests at the start of an iteration, in the shortest signed integer."""
-    return jnp.asarray(max_steps + 1, np.min_scalar_type(-max_steps - 2))
 
 
 def left_after_test(status: Array, tests_left: Array, *, polish: bool = True) -> Array:
@@ -284,30 +284,54 @@ def _pivot_tolerance(status: Array, dtype: Any) -> float | Array:
 def _with_frozen_jacobian(
     problem: Problem, candidate: Float[Array, " n"], max_steps: int
 ) -> Solved:
-    """For more than `MAX_BLOCK` constraints: directions and matrix stay those at the candidate, and
-    a step evaluates only residuals.
+    """For more than `MAX_BLOCK` constraints: for `FROZEN_STEPS` steps directions and matrix stay
+    those at one state, first the candidate, so that a step evaluates only residuals.
 
-    They are compared with the scales at the candidate, because those at each state would need a
-    Jacobian. So at the end we test the result once more, by its own scales.
+    These are compared with the scales at that state, because those at each state would need a
+    Jacobian. So after these steps the result is tested once more, by its own scales. If it is not
+    on the manifold, the next steps have the directions, the matrix and the scales there.
     """
+
+    def linearised_once(now: _Rounds) -> _Rounds:
+        y = now.y
+        jacobian = problem.linearise(y)[1]
+        scale = problem.scale(jacobian, y)
+        row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
+        solve = rows.gram(rows).factorise()
+
+        def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
+            status, to_correct = problem.status(problem.residual(y), scale)
+            tests_left = left_after_test(status, tests_left)
+
+            def move() -> Array:
+                return y - problem.factor.to_state(rows.rmatvec(solve(to_correct / row_scales)))
+
+            moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
+            return where_active(tests_left, moved, y), tests_left
+
+        steps = jnp.minimum(FROZEN_STEPS, max_steps - now.num_iterations)
+        moved, _, count, _ = iterate(advance, y, max_steps=steps)
+        ok, count = problem.is_on_manifold(moved), now.num_iterations + count
+        hopeful = (count > now.num_iterations) & (count < max_steps) & jnp.all(jnp.isfinite(moved))
+        new = _Rounds(moved, ok, count, ~ok & hopeful)
+        return jtu.tree_map(ft.partial(jnp.where, now.goes_on), new, now)
+
+    # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate that
+    # step once for each use of the candidate.
     candidate = lax.optimization_barrier(candidate)
-    jacobian = problem.linearise(candidate)[1]
-    scale = problem.scale(jacobian, candidate)
-    row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
-    solve = rows.gram(rows).factorise()
+    begin = _Rounds(candidate, jnp.asarray(False), jnp.asarray(0), jnp.asarray(True))
+    end = lax.while_loop(lambda now: any_lane(now.goes_on), linearised_once, begin)
+    return Solved(end.y, end.ok, end.num_iterations)
 
-    def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
-        status, to_correct = problem.status(problem.residual(y), scale)
-        tests_left = left_after_test(status, tests_left)
 
-        def move() -> Array:
-            return y - problem.factor.to_state(rows.rmatvec(solve(to_correct / row_scales)))
+class _Rounds(NamedTuple):
+    """The state after some rounds of steps, each with one Jacobian, whether it is on the manifold,
+    the number of iterations, and whether there is another round."""
 
-        moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
-        return where_active(tests_left, moved, y), tests_left
-
-    y, ok, num_iterations, _ = iterate(advance, candidate, max_steps=max_steps)
-    return Solved(y, ok & problem.is_on_manifold(y), num_iterations)
+    y: Float[Array, " n"]
+    ok: Bool[Array, ""]
+    num_iterations: Int[Array, ""]
+    goes_on: Bool[Array, ""]
 
 
 # ---- For starts far away ----

@@ -148,7 +148,10 @@ def updated_units(
     """
     size = largest_of_quantity(jnp.maximum(jnp.abs(end), change), like)
     change = largest_of_quantity(change, like)
-    ratio = change / jnp.where(size > 0, size, 1)
+    # Without the constant the derivative of the quotient would divide by a square, which underflows
+    # where links of a chain at rest are moved by the noise of the others.
+    constant = lax.stop_gradient(jnp.where(size > 0, size, 1))
+    ratio = (change / constant) / jnp.where(size > 0, size / constant, 1)
     ratio = jnp.maximum(ratio, eps_of(change))
     return jnp.maximum(units, size * jnp.sqrt(ratio))
 
