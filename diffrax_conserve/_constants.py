@@ -16,15 +16,16 @@ MAX_STEPS = 50
 # The directions of a correction are the gradients at the candidate for this many steps. Newton's
 # method converges quadratically, so a nearby candidate needs fewer. If these are not enough, the
 # plane of the corrections may miss the manifold, as on a circular orbit, where the states with the
-# given energy and angular momentum are a curve and not a surface. From then on, with up to
-# `MAX_BLOCK` constraints, the directions are the gradients at each state.
+# given energy and angular momentum are a curve and not a surface. From then on the directions are
+# the gradients at each state, or for more than `MAX_ELIMINATION` constraints at some.
 FROZEN_STEPS = 6
 # A correction that does not help is shortened to this share of itself. A half needs twice as many
 # evaluations where it is far too long, and a much smaller share rejects corrections that would have
 # worked.
 BACKTRACKING_FACTOR = 1 / 4
-# Up to this many constraints the matrix is eliminated anew at each state, with pivoting.
-MAX_UNROLLED = 4
+# Up to this many constraints the matrix is eliminated anew at each state, with pivoting. For more
+# that would take longer than the few steps of an iteration that it saves.
+MAX_PIVOTED = 4
 # This power of roundoff, times the root of the number of constraints, is added to the diagonal of
 # larger matrices, as a share of it, so that they can be factored where constraints depend on each
 # other. The residuals of such constraints contradict each other by roundoff, which becomes an error
@@ -36,7 +37,7 @@ REGULARISATION_POWER = 3 / 4
 NUM_REFINEMENTS = 2
 # In a batch the sums over so many unknowns in a Gram matrix are written out. They take a third of
 # the time of a reduction; the program grows with them.
-MAX_WRITTEN_OUT = 64
+MAX_UNROLLED_SUM = 64
 # The derivative of `clip` beyond the bounds; within them it is one. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 SLOPE_BEYOND_BOUNDS = 1e-10
@@ -64,8 +65,8 @@ DENSE_ROW_RATIO = 16
 # A Jacobian with more dense rows than this is treated as dense, because each costs one reverse pass
 # and a solve of the sparse system.
 MAX_DENSE_ROWS = 16
-# Dense matrices and blocks of sparse ones with up to this many rows are eliminated row by row, so
-# that compile time grows with their size. Larger dense ones are factored by LAPACK. Sparse ones
-# whose blocks would be larger are factored by KLU, or solved by iteration; where KLU can be had it
-# is faster, and compiles faster, from blocks of more than `MAX_UNROLLED` rows on.
-MAX_BLOCK = 16
+# Dense matrices and blocks of sparse ones with up to this many rows are eliminated by operations
+# with rows; with the size of blocks compile time grows. Larger dense ones are factored by LAPACK.
+# Sparse ones whose blocks would be larger are factored by KLU, or solved by iteration; where KLU
+# can be had it is faster, and compiles faster, from blocks of more than the second number on.
+MAX_ELIMINATION, MAX_BLOCK_WITH_KLU = 16, 4

@@ -180,7 +180,7 @@ def decide_success_by_the_scale_at_the_candidate(package):
     for name in ("SimplifiedNewton", "Newton"):
         package.around(f"{name}.solve")(wrong)
     # One more iteration would bring such a state to roundoff after all.
-    package.around("left_after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
+    package.around("remaining_after_test")(lambda test, *x, **y: test(*x, **y | {"polish": False}))
 
 
 def polish_along_nearly_parallel_gradients(package):
@@ -223,8 +223,8 @@ def divide_by_the_roundoff_of_a_pivot(package):
 
 
 def eliminate_in_the_given_order(package):
-    @package.around("gauss_jordan")
-    def _(old, matrix, *, ordered=False, **options):
+    @package.around("ldu_factors")
+    def _(old, matrix, *, pivoting=False, **options):
         return old(matrix, **options)
 
 

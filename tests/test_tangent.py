@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import diffrax_conserve as dfc
+from diffrax_conserve._solver.state import updated_units
 
 from .problems import EPS, difference, refused, solve
 from .thinned import some_of
@@ -181,11 +182,11 @@ test_mistakes_with_bounds_are_named = refused(
 )
 
 
-@pytest.mark.parametrize("k", [8, 10, 40])
-def test_a_chain_at_rest_is_pushed_at_its_end(k):
-    """Its links form stairs, so that the others move by the roundoff of the one before, down to
-    numbers that underflow. State and derivative are those of a plain solve up to its tolerance."""
-    corners = np.stack([(np.arange(k) + 2) // 2, (np.arange(k) + 1) // 2], 1)
+@pytest.mark.parametrize(("k", "metric"), [(10, None), (10, 1.0), (40, None)])
+def test_a_chain_at_rest_is_pushed_at_its_end(k, metric):
+    """It is straight, so that each link moves by the square of what moves the next one. The state
+    is that of a plain solve up to its tolerance, and in the Euclidean metric the derivative too."""
+    corners = np.stack([np.arange(1, k + 1), np.zeros(k)], 1)
 
     def lengths(t, y, push):
         return jnp.sum(jnp.diff(y[0], axis=0, prepend=0.0) ** 2, axis=1) - 1
@@ -195,7 +196,10 @@ def test_a_chain_at_rest_is_pushed_at_its_end(k):
 
     links = dfc.Constraint(lengths)
     field = dfc.tangent(free, links.derivative(free), metric=(jnp.inf, 1.0))
-    kept = dfc.ManifoldProjection(dfx.Tsit5(), (links, links.derivative(free)))
+    projection = dfc.SimplifiedNewton(metric=metric)
+    kept = dfc.ManifoldProjection(
+        dfx.Tsit5(), (links, links.derivative(free)), projection=projection
+    )
 
     def end(solver, push):
         y0 = jnp.asarray(corners, float), jnp.zeros((k, 2))
@@ -203,9 +207,20 @@ def test_a_chain_at_rest_is_pushed_at_its_end(k):
         options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode(), max_steps=128)
         return dfx.diffeqsolve(dfx.ODETerm(field), solver, 0.0, 0.1, 1e-3, y0, push, **options).ys
 
-    both = [
+    plain, projected = (
         jax.jit(lambda push, solver=solver: jax.jvp(lambda x: end(solver, x), (push,), (1.0,)))(1.0)
         for solver in (dfx.Tsit5(), kept)
-    ]
-    for plain, projected in zip(*map(jax.tree.leaves, both), strict=True):
-        np.testing.assert_allclose(projected, plain, rtol=0, atol=1e-6 * np.max(np.abs(plain)))
+    )
+    compared = slice(1 if metric is None else 2)
+    pairs = (jax.tree.leaves(both[compared]) for both in (projected, plain))
+    for actual, expected in zip(*pairs, strict=True):
+        np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_units_have_a_derivative_where_squares_underflow():
+    """The unit `√(size change)` of a component that moves by 1e-200 from zero is its size."""
+    like = jax.ShapeDtypeStruct((2,), float)
+    units = lambda y: updated_units(jnp.zeros(2), jnp.abs(y), y, like)  # noqa: E731
+    y = jnp.array([1e-200, 2.0])
+    for value in jax.jvp(units, (y,), (y,)):
+        np.testing.assert_allclose(value, y, rtol=1e-15)

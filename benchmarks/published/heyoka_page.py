@@ -140,7 +140,7 @@ def heyoka(tolerance, times, project=False):
     of_gradient = hy.cfunc(gradient, vars=unknowns)
     value, projections = of_energy(integrator.state)[0], 0
 
-    def left_after_step(integrator):
+    def tests_left_after_step(integrator):
         """Brings the energy back if it is off by more than 1e-6."""
         nonlocal projections
         if abs(of_energy(integrator.state)[0] / value - 1) > 1e-6:
@@ -160,7 +160,7 @@ def heyoka(tolerance, times, project=False):
         return True
 
     begin = time.process_time()
-    found = integrator.propagate_grid(times, callback=left_after_step if project else None)
+    found = integrator.propagate_grid(times, callback=tests_left_after_step if project else None)
     seconds = time.process_time() - begin
     row = dict(steps=int(found[3]), seconds=seconds, tolerance=tolerance)
     return found[-1], row | (dict(projections=projections) if project else {})

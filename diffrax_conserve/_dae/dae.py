@@ -42,8 +42,8 @@ from .newton import (
     MAX_NEWTON_STEPS,
     SparseNewton,
     algebraic_newton,
-    at_rest_near,
     divided,
+    error_oriented_newton,
     least_exact,
 )
 from .radau import Radau
@@ -633,10 +633,9 @@ def _flags(fixed: Any, y: Y) -> np.ndarray:
 
 @final
 class ConstraintProjection(AbstractProjection):
-    """The way back to the constraints. With index 1 it keeps all that the equations differentiate,
-    as the solution does: the state moves in the directions in which `F` has no slopes, and the
-    unknowns there are solved for. With a higher index unknowns without slopes are free, and the
-    others move to the nearest point."""
+    """The projection to the constraints. With index 1 it keeps `∂F/∂y' y`, as the solution does,
+    and solves for the algebraic variables. With a higher index these are free, and the differential
+    variables move to the nearest point."""
 
     dae: DAE
     metric: None = None
@@ -658,7 +657,7 @@ class ConstraintProjection(AbstractProjection):
         if structure.large is not None:
             # Along a ladder of a thousand resistors the voltages underflow.
             problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
-        y, converged = _solved_for(self.dae, problem.t, state, problem.args, at_rest_near)
+        y, converged = _solved_for(self.dae, problem.t, state, problem.args, error_oriented_newton)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
         # scale does not contain. Corrections that have converged tell more.

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, TOLERANCE_IN_EPS
 from .._large.klu import Places, RealFactor, SparseJacobian
-from .._numerics.iterate import Solved, any_lane, iterate, left_after_step, where_active
+from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_step, where_active
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import DenseRows
@@ -68,7 +68,7 @@ class _Factored(NamedTuple):
         pivots = jnp.abs(jnp.diagonal(self.lu[0]))  # of columns whose largest entry was one
         return jnp.all(pivots > TOLERANCE_IN_EPS * eps_of(pivots))
 
-    def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
+    def implied_sizes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
         """For each unknown the least change that the largest term of one of its equations stands
         for, if unknowns have these sizes."""
         slopes = jnp.abs(self.jacobian)
@@ -94,7 +94,7 @@ class _SparseFactored(NamedTuple):
     def regular(self) -> Bool[Array, ""]:
         return self.factor.is_regular
 
-    def least_changes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
+    def implied_sizes(self, size: Float[Array, " m"]) -> Float[Array, " m"]:
         rows, columns, slopes = self.places.rows, self.places.columns, jnp.abs(self.values)
         terms = jax.ops.segment_max(slopes * size[columns], rows, self.places.size)
         least = jnp.where(slopes > 0, terms[rows] / jnp.where(slopes > 0, slopes, 1), jnp.inf)
@@ -133,7 +133,7 @@ def algebraic_newton(
     residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
 ) -> Solved:
     """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
-    z, at_rest, num_iterations, converged = at_rest_near(residual, z, sparse)
+    z, at_rest, num_iterations, converged = error_oriented_newton(residual, z, sparse)
 
     def at_roundoff() -> Bool[Array, ""]:
         if sparse is not None:
@@ -151,7 +151,7 @@ def algebraic_newton(
     return Solved(jnp.where(found, z, jnp.nan), found, num_iterations)
 
 
-def at_rest_near(
+def error_oriented_newton(
     residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
 ) -> Solved:
     """Damped Newton's method with the natural monotonicity test (P. Deuflhard, *Newton Methods for
@@ -180,7 +180,7 @@ def at_rest_near(
         size = jnp.maximum(jnp.abs(z), jnp.abs(trial))
         # An unknown near zero is compared with the change that the largest term of one of its
         # equations stands for, whatever the units of the others are.
-        size = size + eps**0.5 * factored.least_changes(size)
+        size = size + eps**0.5 * factored.implied_sizes(size)
         size = jnp.where(size > 0, jnp.maximum(size, least_exact(z.dtype)), 1)
         norm = lambda x: jnp.max(jnp.abs(x) / size, initial=0)  # noqa: E731
         length, simplified_length = norm(correction), norm(simplified)
@@ -205,7 +205,7 @@ def at_rest_near(
         larger_tried = (damping == 1) | (larger_tried & ~better)
         at_rest = (converged | (~going & (length < jnp.inf))) & factored.regular()
         moved = where_active(tests_left, (z, damping, larger_tried, converged), now)
-        return moved, left_after_step(at_rest, going, tests_left)
+        return moved, remaining_after_step(at_rest, going, tests_left)
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(True), jnp.asarray(False)
     (z, *_, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)

@@ -15,7 +15,7 @@ from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, iterate, left_after_step, where_active
+from .._numerics.iterate import Solved, iterate, remaining_after_step, where_active
 from .._options import check_counts
 from .._projection.options import check_state, option, refuse_half_precision
 from .._solver.terms import in_field_time, vector_fields
@@ -199,7 +199,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 # A change by the roundoff of the state cannot become smaller.
                 rounded = now_size <= size(TOLERANCE_IN_EPS * eps_of(new) * new, new)
                 converged = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-                then = left_after_step(converged, rate < 2, tests_left)
+                then = remaining_after_step(converged, rate < 2, tests_left)
                 return where_active(tests_left, (new, now_size), now), then
 
             begin = guess, jnp.asarray(jnp.inf, start.dtype)

@@ -133,13 +133,13 @@ class Structure:
         """As `units`, for a constraint Jacobian. The sizes of unknowns without slopes are not used:
         they may have any ratios, as at a start where some vanish, and a Gram matrix would square
         these. Their units are such that the largest element in the column of each is one, where the
-        largest element of each row is one; and all are so large that in each row one of them
-        exceeds what the other unknowns contribute by the factor `1/ε`."""
-        others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest()
+        largest element of each row is one; and all are so large that in each row that has
+        one, one exceeds what the other unknowns contribute by the factor `1/ε`."""
+        others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest_in_rows()
         free = jacobian.scale_columns(jnp.asarray(self._is_free, sizes.dtype))
-        largest = free.largest()
+        largest = free.largest_in_rows()
         is_zero, divisor = largest == 0, jnp.where(largest > 0, largest, 1)
-        column = free.divide_rows(divisor).largest_in_columns(self.size)
+        column = free.divide_rows(divisor).largest_in_columns()
         factor = jnp.max(jnp.where(is_zero, 0, others / divisor), initial=0)
         factor = jnp.where(factor > 0, factor, 1) / eps_of(sizes)
         return jnp.where(self._is_free, factor / jnp.where(column > 0, column, 1), sizes)

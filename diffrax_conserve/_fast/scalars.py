@@ -118,12 +118,12 @@ def written_out(
 
 
 def with_lanes_last(run: Callable[[Any, Array, bool], Any], given: Any, y: Array) -> Any:
-    """`run(each, y, is_batched)`, where `each(fn)(*xs)` is `fn(given, *xs)`.
+    """`run(map_lanes, y, is_batched)`, where `map_lanes(fn)(*xs)` is `fn(given, *xs)`.
 
     In a batch the lanes are the last axis of `y`, of all `xs`, and of all results, so that an
     operation on small arrays is a loop over the lanes, which the processor does several at a time.
     With the lanes first, as `vmap` has them, its innermost loop is over the few elements of one.
-    `each(fn)` maps a function of one lane over them, in scalars, if that is not too large.
+    `map_lanes(fn)` maps a function of one lane over them, in scalars, if that is not too large.
     """
     arrays, static = eqx.partition(given, eqx.is_array)
     leaves, treedef = jtu.tree_flatten(arrays)
@@ -136,11 +136,11 @@ def with_lanes_last(run: Callable[[Any, Array, bool], Any], given: Any, y: Array
 
     @ft.partial(jax.jit, static_argnums=0)
     def lanes(axes: tuple[int | None, ...], leaves: Any, y: Array) -> Any:
-        def each(fn: Callable[..., Any]) -> Callable[..., Any]:
+        def map_lanes(fn: Callable[..., Any]) -> Callable[..., Any]:
             of_leaves = lambda leaves, *xs: fn(whole(leaves), *xs)  # noqa: E731
             return lambda *xs: _mapped(of_leaves, [*axes], leaves, xs)
 
-        out = run(each, jnp.moveaxis(y, 0, -1), True)
+        out = run(map_lanes, jnp.moveaxis(y, 0, -1), True)
         return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), out)
 
     @alone.def_vmap

@@ -30,10 +30,10 @@ from jaxtyping import Array, Float
 
 from .._constants import (
     DENSE_ROW_RATIO,
-    MAX_BLOCK,
+    MAX_BLOCK_WITH_KLU,
     MAX_DENSE_ROWS,
     MAX_DENSE_SYSTEM,
-    MAX_UNROLLED,
+    MAX_ELIMINATION,
     MIN_SPARSE,
 )
 from .._memory import Memory
@@ -103,7 +103,7 @@ class Pattern:
         _, labels = sp.csgraph.connected_components(graph, directed=False)
         sizes = np.bincount(labels)
         block = int(sizes.max())
-        if block <= MAX_BLOCK:
+        if block <= MAX_ELIMINATION:
             by_label = np.argsort(labels, kind="stable")
             starts = np.cumsum(sizes) - sizes
             order = np.full(len(sizes) * block, self.size)
@@ -119,7 +119,7 @@ class Pattern:
         best = int(np.argmin(widths))
         # Wider blocks, written out, compile for long, and KLU is faster with them.
         by_klu = self.size + self.num_columns > MAX_DENSE_SYSTEM and self.klu
-        if widths[best] > (MAX_UNROLLED if by_klu else MAX_BLOCK):
+        if widths[best] > (MAX_BLOCK_WITH_KLU if by_klu else MAX_ELIMINATION):
             return sparse, 0, False
         return sparse[orders[best]], widths[best], True
 

@@ -20,13 +20,13 @@ import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from .._constants import MAX_STEPS, MAX_UNROLLED
+from .._constants import MAX_PIVOTED, MAX_STEPS
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Values, Y
 from .._hashable import Hashable
 from .._interpolation import AsArrays
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, any_lane, iterate, left_after_test, where_active
+from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_test, where_active
 from .._numerics.linear import Solve, iterative_refinement
 from .._numerics.metric import Diagonal, broadcast_option
 from .._numerics.problem import Problem, problem_of
@@ -34,7 +34,7 @@ from .._numerics.rows import AbstractGram, AbstractRows, solve_dense
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
 from .._solver.failure import failure_cause, masked_step, starts_off_manifold
-from .._solver.state import StepEnd, initial_values
+from .._solver.state import StepFingerprint, initial_values
 from .._solver.terms import in_field_time, is_backsolve, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, tree_shapes, unflatten, unravel
@@ -61,7 +61,7 @@ class _State(eqx.Module):
     - `multiplier`: the multiplier of the last step, the guess for the next.
     - `cancellation`: the part of the scales that the gradients do not show.
     - `off`: whether a start was off the constraint, so that every step fails.
-    - `last_end`: the end of the last step.
+    - `last_fingerprint`: the end of the last step.
     """
 
     at: _Linear
@@ -69,7 +69,7 @@ class _State(eqx.Module):
     multiplier: Float[Array, " m"]
     cancellation: Float[Array, " m"]
     off: Bool[Array, ""]
-    last_end: StepEnd
+    last_fingerprint: StepFingerprint
 
 
 @final
@@ -205,8 +205,8 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         terms, t0 = in_field_time(terms, t0)
         _, cancellation = initial_values(self.constraint, t0, q, args)
         at, slope, off = self._started(terms, t0, y0, args, cancellation)
-        end = StepEnd.before_first(self.constraint, cancellation.dtype)
-        end = end.moved(t0, ravel(y0), args, self.constraint)
+        end = StepFingerprint.before_first(self.constraint, cancellation.dtype)
+        end = end.at(t0, ravel(y0), args, self.constraint)
         return _State(at, slope, jnp.zeros_like(cancellation), cancellation, off, end)
 
     def _started(
@@ -246,7 +246,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         middle = t0 + (t1 - t0) / 2
         drift = self._drift(terms, middle, v0, args)
         old = state.at, state.slope, state.off
-        changed = state.last_end.differs(t0, ravel(y0), args, self.constraint) | made_jump
+        changed = state.last_fingerprint.differs(t0, ravel(y0), args, self.constraint) | made_jump
 
         def anew() -> Any:
             new = self._started(terms, t0, y0, args, state.cancellation)
@@ -285,7 +285,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         (q1, v1), result = masked_step(cause, (q1, v1), dfx.RESULTS.successful)
         dense_info = dict(y0=y0, step=AsArrays(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
-        end = state.last_end.moved(t1, jnp.concatenate([q1, v1]), args, self.constraint)
+        end = state.last_fingerprint.at(t1, jnp.concatenate([q1, v1]), args, self.constraint)
         state = _State(at, slope, multiplier, state.cancellation, off, end)
         return (unravel(q1, q0), unravel(v1, v0)), None, dense_info, state, result
 
@@ -366,12 +366,12 @@ def _shake(
         causes as the right side, which has no contradiction. For up to four constraints the
         solution has no such part."""
         x = solve(g)
-        return x if len(g) <= MAX_UNROLLED else solve(at.jacobian.matvec(moves(x)))
+        return x if len(g) <= MAX_PIVOTED else solve(at.jacobian.matvec(moves(x)))
 
     def advance(x: Array, tests_left: Array) -> tuple[Array, Array]:
         g = _barrier(problem.residual(_barrier(position(x))))
         status, _ = problem.status(g, scale)
-        tests_left = left_after_test(status, tests_left)
+        tests_left = remaining_after_test(status, tests_left)
         return where_active(tests_left, x - change(g), x), tests_left
 
     return iterate(advance, guess, max_steps=max_steps)

@@ -18,7 +18,7 @@ from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScala
 from .._interpolation import AsArrays
 from .._manifold import check_manifold
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, any_lane, iterate, left_after_test, where_active
+from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_test, where_active
 from .._numerics.problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -255,7 +255,7 @@ def _solved(
     def advance(now: _Unknowns, tests_left: Array) -> tuple[_Unknowns, Array]:
         g, jacobian = end.linearise(now.y)
         rows = end.factor.scaled_rows(jacobian)
-        status, to_correct = end.status(g, end.scale(jacobian, now.y))
+        status, residual_to_correct = end.status(g, end.scale(jacobian, now.y))
         # The residual of the equation for the state, with the gradients at that state.
         defect = now.candidate + end.factor.to_state(rows.rmatvec(now.multiplier)) - now.y
         off = end.factor.norm(defect) / (eps * end.factor.norm(jnp.abs(y0) + jnp.abs(now.y)))
@@ -266,14 +266,17 @@ def _solved(
             jnp.where(off <= TOLERANCE_IN_EPS, WITHIN_TOLERANCE, ABOVE_TOLERANCE),
         )
         solved = jnp.where(off < jnp.inf, solved, NOT_FINITE)
-        tests_left = left_after_test(jnp.minimum(status, solved), tests_left)
+        tests_left = remaining_after_test(jnp.minimum(status, solved), tests_left)
         # Where the inner step has failed, there is nothing to go on with.
         tests_left = jnp.where(now.result == dfx.RESULTS.successful, tests_left, -1)
 
         def move() -> _Unknowns:
             scaled = rows.divide_rows(row_scales)
             gram = jtu.tree_map(jnp.add, gram0, scaled.gram(scaled))
-            change = gram.solve((to_correct + jacobian.matvec(defect)) / row_scales) / row_scales
+            change = (
+                gram.solve((residual_to_correct + jacobian.matvec(defect)) / row_scales)
+                / row_scales
+            )
             return stepped(now.multiplier - change, rows)
 
         moved = lax.cond(any_lane(tests_left > 0), move, lambda: now)

@@ -11,8 +11,8 @@ is called a step of the solver.
   gradients `U = G(ŷ) S` at the candidate. As these directions are fixed, the result is a function
   of the candidate and of the multipliers, and has a derivative by the implicit function theorem;
   see `implicit`. For up to four constraints the matrix `G(y) S Uᵀ` of a step is evaluated at the
-  last state, so that the iteration is Newton's method; for more it is evaluated at the candidate,
-  and for up to sixteen, if a few steps are not enough, at the states after them.
+  current state, so that the iteration is Newton's method; for more it is evaluated at the
+  candidate, and if a few steps are not enough, at states after them.
 - `semismooth_newton` keeps a state within bounds, along given directions, with a line search.
 - `damped_newton` is for starts far away. Without given directions each step is the shortest, in the
   metric, that solves the equations linearised at the last state (P. Deuflhard, *Newton Methods for
@@ -37,20 +37,20 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import (
     BACKTRACKING_FACTOR,
     FROZEN_STEPS,
-    MAX_BLOCK,
-    MAX_UNROLLED,
+    MAX_ELIMINATION,
+    MAX_PIVOTED,
     SLOPE_BEYOND_BOUNDS,
     TOLERANCE_IN_EPS,
 )
 from .._fast.scalars import with_lanes_last
 from .linear import (
     diagonal_shift,
-    gauss_jordan,
-    gauss_jordan_solution,
-    given_order,
     gram_matrix,
+    ldu_factors,
+    ldu_solution,
+    natural_order,
     roundoff_pivot_tolerance,
-    written_out_product,
+    unrolled_matvec,
 )
 from .problem import (
     ABOVE_TOLERANCE,
@@ -63,7 +63,8 @@ from .problem import (
 from .rows import AbstractRows, DenseRows
 
 # A step of an iteration: from the unknowns and `tests_left` to both after it. While `tests_left` is
-# positive it is the number of tests that are still allowed; zero means success, less a failure.
+# positive it is the number of tests that are still allowed; zero means success, and a negative
+# number a failure.
 Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
@@ -92,7 +93,7 @@ def iterate(
 
     `tests_left` is the number of tests that are left. The unknowns are tested before each step and
     after the last one, so that it starts at `max_steps + 1`. When the iteration ends, it is zero if
-    the unknowns passed their last test, and -1 if they did not; see `left_after_test`.
+    the unknowns passed their last test, and -1 if they did not; see `remaining_after_test`.
 
     The lanes of a batch advance together until none goes on. So `advance` must leave unknowns that
     are done, for which no test is left, as they are. If the lanes are the last axis of the
@@ -113,7 +114,7 @@ def iterate(
     return Solved(y, tests_left == 0, count)
 
 
-def left_after_test(status: Array, tests_left: Array, *, polish: bool = True) -> Array:
+def remaining_after_test(status: Array, tests_left: Array, *, polish: bool = True) -> Array:
     """The number of tests that are left after unknowns of this `status` were tested.
 
     At `AT_ROUNDOFF` the iteration ends. Where the unknowns are merely within the tolerance, one
@@ -131,7 +132,7 @@ def left_after_test(status: Array, tests_left: Array, *, polish: bool = True) ->
     return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 
 
-def left_after_step(converged: Array, hopeful: Array, tests_left: Array) -> Array:
+def remaining_after_step(converged: Array, hopeful: Array, tests_left: Array) -> Array:
     """The number of tests that are left after a step, in an iteration that tests the lengths of its
     steps: `converged` if the step is so short that it is the last, `hopeful` if more may help."""
     then = jnp.where(converged, 0, jnp.where(hopeful & (tests_left > 1), tests_left - 1, -1))
@@ -171,21 +172,20 @@ def simplified_newton(
     max_steps: int,
 ) -> Solved:
     """The state `ŷ + S Uᵀ λ` on the manifold. The rows of `U` are the `directions` if these are
-    given, for at most `MAX_UNROLLED` constraints. Otherwise they are the gradients at the
-    candidate, and with up to `MAX_BLOCK` constraints, after `FROZEN_STEPS` iterations, those at
-    each state."""
+    given, for at most `MAX_PIVOTED` constraints. Otherwise they are the gradients at the candidate,
+    and after `FROZEN_STEPS` iterations those at later states."""
     m = problem.num_residuals
-    assert directions is None or m <= MAX_UNROLLED
-    if m > MAX_BLOCK:
+    assert directions is None or m <= MAX_PIVOTED
+    if m > MAX_ELIMINATION:
         return _with_frozen_jacobian(problem, candidate, max_steps)
     return with_lanes_last(
-        ft.partial(_of_few_constraints, m, directions is not None, max_steps),
+        ft.partial(_newton_of_few_constraints, m, directions is not None, max_steps),
         (problem, directions),
         candidate,
     )
 
 
-def _of_few_constraints(
+def _newton_of_few_constraints(
     m: int,
     has_directions: bool,
     max_steps: int,
@@ -193,10 +193,11 @@ def _of_few_constraints(
     candidate: Array,
     is_batched: bool,
 ) -> Solved:
-    """For up to `MAX_BLOCK` constraints. In a batch the lanes are the last axis of all arrays; see
-    `with_lanes_last`. The Jacobian stands at one place in the program, which makes it small.
+    """For up to `MAX_ELIMINATION` constraints. In a batch the lanes are the last axis of all
+    arrays; see `with_lanes_last`. The Jacobian stands at one place in the program, which makes it
+    small.
 
-    Up to `MAX_UNROLLED` constraints have a matrix of each state. Pivots that are roundoff count as
+    Up to `MAX_PIVOTED` constraints have a matrix of each state. Pivots that are roundoff count as
     infinite: if the other constraints hold, these hold too.
 
     For more the matrix is that at the candidate, factored once, in the first step. For
@@ -207,29 +208,31 @@ def _of_few_constraints(
     millionth, as near a circular orbit. What the first steps have left over may be in such a
     direction, so after them only roundoff is added.
     """
-    keeps_matrix = m > MAX_UNROLLED
+    keeps_matrix = m > MAX_PIVOTED
 
-    def tested(given: Any, y: Array) -> tuple[Array, ...]:
+    def residual_test(given: Any, y: Array) -> tuple[Array, ...]:
         problem, _ = given
         g, jacobian = problem.linearise(y)
-        status, to_correct = problem.status(g, problem.scale(jacobian, y))
-        return status, to_correct, problem.factor.scaled_rows(jacobian).matrix
+        status, residual_to_correct = problem.status(g, problem.scale(jacobian, y))
+        return status, residual_to_correct, problem.factor.scaled_rows(jacobian).matrix
 
     def advance(now: Any, tests_left: Array) -> tuple[Any, Array]:
         y, *previous = now
-        status, to_correct, rows = map_lanes(tested)(y)
+        status, residual_to_correct, rows = map_lanes(residual_test)(y)
         is_first, frozen = tests_left > max_steps, tests_left > max_steps + 1 - FROZEN_STEPS
-        tests_left = left_after_test(status, tests_left)
+        # These are by the number before the test, which may set it to two for a step that polishes.
+        # If that step leaves the tolerance, the next one is along the current gradients.
+        tests_left = remaining_after_test(status, tests_left)
         refresh = is_first | (~frozen & (tests_left > 0))
-        roundoff, in_general = roundoff_pivot_tolerance(rows.dtype), diagonal_shift(rows)
 
         def factors_of(rows: Array, directions: Array) -> tuple[Any, ...]:
             left, right = (DenseRows(x).equilibrated()[1].matrix for x in (rows, directions))
             matrix = gram_matrix(left, right)
             if not keeps_matrix:
-                least = _pivot_tolerance(status, rows.dtype)
-                return gauss_jordan(matrix, pivot_tolerance=least, ordered=True)
-            return gauss_jordan(matrix, added=jnp.where(frozen, in_general, roundoff))[:1]
+                tolerance = _pivot_tolerance(status, rows.dtype)
+                return ldu_factors(matrix, pivot_tolerance=tolerance, pivoting=True)
+            shift = jnp.where(frozen, diagonal_shift(rows), roundoff_pivot_tolerance(rows.dtype))
+            return ldu_factors(matrix, added=shift)[:1]
 
         def refreshed() -> list[Array]:
             new = [rows, *factors_of(rows, rows)]
@@ -238,25 +241,27 @@ def _of_few_constraints(
         def move() -> list[Array]:
             if keeps_matrix:
                 linearisation = lax.cond(any_lane(refresh), refreshed, lambda: previous)
-                of_matrix, factors = linearisation
-                pivot_step = given_order(m, lanes)
+                matrix_rows, factors = linearisation
+                pivot_step = natural_order(m, lanes)
             else:
-                linearisation, of_matrix = previous, rows
+                linearisation, matrix_rows = previous, rows
                 if not has_directions:
                     linearisation = [jnp.where(refresh, rows, *previous)]
                 factors, pivot_step = factors_of(rows, *linearisation)
-            row_scales, _ = DenseRows(of_matrix).equilibrated()
+            row_scales, _ = DenseRows(matrix_rows).equilibrated()
             _, directions = DenseRows(linearisation[0]).equilibrated()
-            multiplier = gauss_jordan_solution(factors, pivot_step, to_correct / row_scales)
-            change = written_out_product(jnp.moveaxis(directions.matrix, 1, 0), multiplier)
+            multiplier = ldu_solution(factors, pivot_step, residual_to_correct / row_scales)
+            change = unrolled_matvec(jnp.moveaxis(directions.matrix, 1, 0), multiplier)
             to_state = map_lanes(lambda given, x: given[0].factor.to_state(x))
             return [y - to_state(change), *linearisation]
 
-        # Alone, for a few constraints, a branch takes longer than what it avoids.
+        # Outside a batch, for a few constraints, a branch takes longer than what it avoids.
         branch = is_batched or keeps_matrix
         moved, *kept = lax.cond(any_lane(tests_left > 0), move, lambda: now) if branch else move()
         return [where_active(tests_left, moved, y), *kept], tests_left
 
+    # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate that
+    # step once for each use of the candidate.
     candidate = lax.optimization_barrier(candidate)
     n, *lanes = candidate.shape
     if has_directions:
@@ -284,8 +289,8 @@ def _pivot_tolerance(status: Array, dtype: Any) -> float | Array:
 def _with_frozen_jacobian(
     problem: Problem, candidate: Float[Array, " n"], max_steps: int
 ) -> Solved:
-    """For more than `MAX_BLOCK` constraints: for `FROZEN_STEPS` steps directions and matrix stay
-    those at one state, first the candidate, so that a step evaluates only residuals.
+    """For more than `MAX_ELIMINATION` constraints: for `FROZEN_STEPS` steps directions and matrix
+    stay those at one state, first the candidate, so that a step evaluates only residuals.
 
     These are compared with the scales at that state, because those at each state would need a
     Jacobian. So after these steps the result is tested once more, by its own scales. If it is not
@@ -300,11 +305,13 @@ def _with_frozen_jacobian(
         solve = rows.gram(rows).factorise()
 
         def advance(y: Array, tests_left: Array) -> tuple[Array, Array]:
-            status, to_correct = problem.status(problem.residual(y), scale)
-            tests_left = left_after_test(status, tests_left)
+            status, residual_to_correct = problem.status(problem.residual(y), scale)
+            tests_left = remaining_after_test(status, tests_left)
 
             def move() -> Array:
-                return y - problem.factor.to_state(rows.rmatvec(solve(to_correct / row_scales)))
+                return y - problem.factor.to_state(
+                    rows.rmatvec(solve(residual_to_correct / row_scales))
+                )
 
             moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
             return where_active(tests_left, moved, y), tests_left
@@ -316,9 +323,7 @@ def _with_frozen_jacobian(
         new = _Rounds(moved, ok, count, ~ok & hopeful)
         return jtu.tree_map(ft.partial(jnp.where, now.goes_on), new, now)
 
-    # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate that
-    # step once for each use of the candidate.
-    candidate = lax.optimization_barrier(candidate)
+    candidate = lax.optimization_barrier(candidate)  # as for few constraints
     begin = _Rounds(candidate, jnp.asarray(False), jnp.asarray(0), jnp.asarray(True))
     end = lax.while_loop(lambda now: any_lane(now.goes_on), linearised_once, begin)
     return Solved(end.y, end.ok, end.num_iterations)
@@ -366,16 +371,16 @@ def damped_newton(
         y, is_first = now.y, now.largest == jnp.inf
         g, jacobian = lax.optimization_barrier(problem.linearise(y))
         scale_at_y = problem.scale(jacobian, y)
-        status, to_correct = problem.status(g, scale_at_y)
+        status, residual_to_correct = problem.status(g, scale_at_y)
         # A start that is not finite is hopeless. Later states are not: their step was too long.
         status = jnp.where(is_first, status, jnp.maximum(status, ABOVE_TOLERANCE))
-        tests_left = left_after_test(status, tests_left, polish=polish)
+        tests_left = remaining_after_test(status, tests_left, polish=polish)
         scale = jnp.where(is_first, scale_at_y, now.scale)
         residuals = jnp.abs(relative_to_scale(g, scale))
         is_smaller = jnp.all(residuals <= now.largest)  # false if one is NaN
         row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
         current = rows if directions is None else directions
-        change = rows.gram(current).row_space_correction(current, to_correct / row_scales)
+        change = rows.gram(current).row_space_correction(current, residual_to_correct / row_scales)
         newton_point = y - problem.factor.to_state(change)
         backtracked = now.best + BACKTRACKING_FACTOR * (y - now.best)
         best = jnp.where(is_smaller, y, now.best)
@@ -405,7 +410,7 @@ def semismooth_newton(
     def advance(z: Array, tests_left: Array) -> tuple[Array, Array]:
         g, jacobian = lax.optimization_barrier(problem.linearise(z))
         status, _ = problem.status(g, problem.scale(jacobian, z))
-        tests_left = left_after_test(status, tests_left, polish=False)
+        tests_left = remaining_after_test(status, tests_left, polish=False)
         row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
         # Residuals that are noise are corrected too. Components at their bounds couple the
         # constraints, so that what is noise for one constraint may be what another needs.

@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._constants import MAX_WRITTEN_OUT, NUM_REFINEMENTS, REGULARISATION_POWER, TOLERANCE_IN_EPS
+from .._constants import MAX_UNROLLED_SUM, NUM_REFINEMENTS, REGULARISATION_POWER, TOLERANCE_IN_EPS
 from .._tree import eps_of
 
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
@@ -66,7 +66,7 @@ def gram_matrix(
     _, n, *lanes = rows.shape
     dtype = np.promote_types(rows.dtype, np.float32)
     rows, others = rows.astype(dtype), others.astype(dtype)
-    if n > MAX_WRITTEN_OUT:
+    if n > MAX_UNROLLED_SUM:
         return jnp.einsum("ik...,jk...->ij...", rows, others, precision=lax.Precision.HIGHEST)
     if not lanes:
         return jnp.sum(rows[:, None] * others[None], axis=2)
@@ -74,38 +74,35 @@ def gram_matrix(
     return ft.reduce(op.add, (x[:, None] * y[None] for x, y in pairs))
 
 
-def gauss_jordan(
+def ldu_factors(
     matrix: Float[Array, "m m *lanes"],
     *,
     added: float | Array = 0.0,
     pivot_tolerance: float | Array = 0.0,
-    ordered: bool = False,
+    pivoting: bool = False,
 ) -> tuple[Float[Array, "m m *lanes"], Array | np.ndarray]:
-    """The factors of a small Gram matrix for `gauss_jordan_solution`, by Gaussian elimination, and
-    for each row the number of the step in which it was the pivot row.
+    """`A = L D U` for a small Gram matrix, by Gaussian elimination: `L⁻¹` below the diagonal, the
+    pivots `D` on it, and `U⁻¹` above it, if rows and columns are in the order of elimination. The
+    second result is the step in which each row was the pivot row, and `m` for the row that is left.
 
     To each element of the diagonal its share `added` is added, and a pivot of at most its share
     `pivot_tolerance` counts as infinite, so that its multiplier is zero.
 
     Divided by the element on the diagonal of the matrix, a pivot is the squared sine of the angle
-    between the gradient of a constraint and the span of the gradients before it. If `ordered`, the
+    between the gradient of a constraint and the span of the gradients before it. If `pivoting`, the
     next constraint is that with the largest: if a nearly parallel gradient came earlier, its
     roundoff would be magnified in the pivots of those that could replace it. Otherwise the order is
-    the given one, which `U Uᵀ` allows, and `U Vᵀ` for directions `V` near `U`. No rows are
+    the natural one, which `U Uᵀ` allows, and `U Vᵀ` for directions `V` near `U`. No rows are
     exchanged. LAPACK takes longer for such matrices, and its threads wait for each other on a busy
     machine.
 
-    The pivots are on the diagonal of the result, and the inverses of both triangular factors take
-    the places of the elements that were eliminated (Gauss and Jordan). We do not multiply the two:
-    where constraints depend on each other, the elements of the inverse are as large as one over
-    what is added to the diagonal, and the roundoff of the product would spoil what the constraints
-    determine.
+    The inverse factors are not multiplied, as in `inverse_factors`.
 
     What is done with an element is one loop over the lanes, and the steps of the elimination are a
     loop too, so that no kernel repeats the steps before it.
     """
     m, _, *lanes = matrix.shape
-    j = given_order(m, lanes)
+    j = natural_order(m, lanes)
     on_diagonal = j[:, None] == j[None]
     of_lanes = lambda x: jnp.broadcast_to(jnp.asarray(x, matrix.dtype), (1, *lanes))  # noqa: E731
     added, pivot_tolerance = of_lanes(added), of_lanes(pivot_tolerance)
@@ -116,12 +113,12 @@ def gauss_jordan(
         pivots = _diagonal(matrix)
         return jnp.where(jnp.abs(pivots) <= pivot_tolerance * size, jnp.inf, pivots)
 
-    def eliminate(k: Array | int, now: tuple[Array, Any], ordered: bool) -> tuple[Array, Any]:
+    def eliminate(k: Array | int, now: tuple[Array, Any], pivoting: bool) -> tuple[Array, Any]:
         matrix, pivot_step = now
-        is_left = pivot_step == m
-        if ordered:
+        is_remaining = pivot_step == m
+        if pivoting:
             relative_pivot = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
-            relative_pivot = jnp.where(is_left, relative_pivot, -1)
+            relative_pivot = jnp.where(is_remaining, relative_pivot, -1)
             is_k = j == jnp.argmax(relative_pivot, axis=0, keepdims=True)
         else:
             is_k = j == k
@@ -130,46 +127,46 @@ def gauss_jordan(
         pivot = jnp.sum(jnp.where(is_k, pivots_of(matrix), 0), axis=0, keepdims=True)
         row, column = jnp.where(is_k, 1, row) / pivot, jnp.where(is_k, 1, column)
         rest = jnp.where(is_k[:, None] | is_k[None], 0, matrix) - column[:, None] * row[None]
-        is_left = is_left & ~is_k
-        matrix = jnp.where(is_left[:, None] | is_left[None], rest, matrix)
+        is_remaining = is_remaining & ~is_k
+        matrix = jnp.where(is_remaining[:, None] | is_remaining[None], rest, matrix)
         return matrix, pivot_step + is_k.astype(int) * (k - m)
 
     pivot_step = np.full((m, *lanes), m)
-    if m > 1:  # the first quotients of pivots are all one
+    if m > 1:  # all relative pivots are one, so that the natural order will do
         matrix, pivot_step = eliminate(0, (matrix, pivot_step), False)
     if m > 2:
-        steps = ft.partial(eliminate, ordered=ordered)
+        steps = ft.partial(eliminate, pivoting=pivoting)
         matrix, pivot_step = lax.fori_loop(1, m - 1, steps, (matrix, pivot_step))
     return jnp.where(on_diagonal, pivots_of(matrix), matrix), pivot_step
 
 
 def _diagonal(matrix: Float[Array, "m m *lanes"]) -> Float[Array, "m *lanes"]:
-    order = given_order(len(matrix), matrix.shape[2:])
+    order = natural_order(len(matrix), matrix.shape[2:])
     return jnp.sum(jnp.where(order[:, None] == order[None], matrix, 0), axis=0)
 
 
-def gauss_jordan_solution(
+def ldu_solution(
     factors: Float[Array, "m m *lanes"],
     pivot_step: Array | np.ndarray,
     b: Float[Array, "m *lanes"],
 ) -> Array:
-    """`matrix⁻¹ b`, by what `gauss_jordan` returns."""
-    after, before = pivot_step[:, None], pivot_step[None]
+    """`matrix⁻¹ b`, by what `ldu_factors` returns."""
+    row_step, column_step = pivot_step[:, None], pivot_step[None]
     pivots = _diagonal(factors)
     # XLA does not repeat a quotient in each kernel that uses it, as it does with a product. Where
     # gradients are nearly parallel, the multipliers are large and cancel, so that all that uses one
     # must see the same number.
     x = b.astype(factors.dtype)
-    x = (x + written_out_product(jnp.where(after > before, factors, 0), x)) / pivots
-    return (x + written_out_product(jnp.where(after < before, factors, 0), x)).astype(b.dtype)
+    x = (x + unrolled_matvec(jnp.where(row_step > column_step, factors, 0), x)) / pivots
+    return (x + unrolled_matvec(jnp.where(row_step < column_step, factors, 0), x)).astype(b.dtype)
 
 
-def given_order(m: int, lanes: Sequence[int]) -> np.ndarray:
-    """The step in which each row is the pivot row, if the order is the given one."""
+def natural_order(m: int, lanes: Sequence[int]) -> np.ndarray:
+    """The indices of the rows, which are their steps of elimination without pivoting."""
     return np.arange(m).reshape(m, *[1] * len(lanes))
 
 
-def written_out_product(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
+def unrolled_matvec(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
     """`matrix x`, as a sum that is written out, which XLA fuses with what is around it."""
     columns = zip(jnp.unstack(matrix, axis=1), jnp.unstack(x), strict=True)
     return ft.reduce(op.add, (column * element[None] for column, element in columns))
@@ -210,7 +207,7 @@ def forward_elimination(
     size = [jnp.abs(matrix[k][k]) for k in range(m)]
     rhs, reduced_rows = [*jnp.unstack(b)], [*jnp.unstack(rows)]
     for k in range(m):
-        # At `k = 0` all quotients are one, so that nothing is exchanged.
+        # At `k = 0` all relative pivots are one, so that nothing is exchanged.
         for i in range(k + 1, m) if k else ():
             larger = jnp.abs(matrix[i][i]) * size[k] > jnp.abs(matrix[k][k]) * size[i]
             for each in (*matrix[k:], matrix, size, rhs, reduced_rows):

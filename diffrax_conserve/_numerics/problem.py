@@ -156,10 +156,6 @@ class Problem(eqx.Module):
         eps = eps_of(scale)
         rtol = TOLERANCE_IN_EPS * eps if self.rtol is None else self.rtol
         limit = jnp.asarray(rtol, scale.dtype) * scale
-        if scale.dtype == jnp.float64:
-            # No unit makes a quantity so small, but the links of a chain at rest have speeds that
-            # are the roundoff of the roundoff of others.
-            limit = jnp.maximum(limit, float(jnp.finfo(scale.dtype).tiny) / eps)
         return limit if self.atol is None else limit + jnp.asarray(self.atol, scale.dtype)
 
     def status(

@@ -7,13 +7,13 @@ Gram matrices are singular where constraints depend on each other, as when an in
 twice. The multipliers are then not unique, but the correction is, if the constraints do not
 contradict each other. There are three ways to solve such a system.
 
-- Up to four constraints: Gaussian elimination with diagonal pivoting, written out in scalars, or in
-  a loop where `iterate` projects three and four that are near the manifold. The next constraint is
-  that whose gradient has the largest angle to the span of the gradients before it. If the gradient
-  is in this span, its pivot is roundoff, and the multiplier is set to zero: if the other
-  constraints hold, this one holds too. Gradients that are only nearly parallel are all kept,
-  because a correction needs the direction in which they differ. A derivative does not need it, and
-  would lose its digits in that direction; see `implicit`. Below double precision, the last
+- Up to four constraints: Gaussian elimination with diagonal pivoting, in scalars that are written
+  out (`forward_elimination`), or near the manifold and in `RATTLE` in a loop (`ldu_factors`). The
+  next constraint is that whose gradient has the largest angle to the span of the gradients before
+  it. If the gradient is in this span, its pivot is roundoff, and the multiplier is set to zero: if
+  the other constraints hold, this one holds too. Gradients that are only nearly parallel are all
+  kept, because a correction needs the direction in which they differ. A derivative does not need
+  it, and would lose its digits in that direction; see `implicit`. Below double precision, the last
   iteration, which only polishes, does not need it either; see `iterate`.
 - More constraints: elimination without pivoting for up to sixteen, otherwise LU factors by LAPACK,
   with a small share of the diagonal added, so that no pivot vanishes. In a derivative the share is
@@ -33,18 +33,18 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_BLOCK, MAX_UNROLLED
+from .._constants import MAX_ELIMINATION, MAX_PIVOTED
 from .._tree import eps_of
 from .linear import (
     Solve,
     diagonal_shift,
     forward_elimination,
-    gauss_jordan,
-    gauss_jordan_solution,
-    given_order,
     iterative_refinement,
+    ldu_factors,
+    ldu_solution,
     lu_factors,
     lu_solution,
+    natural_order,
     roundoff_pivot_tolerance,
 )
 
@@ -78,12 +78,12 @@ class AbstractRows(eqx.Module):
         """`diag(row_scales)⁻¹ U`."""
 
     @abc.abstractmethod
-    def largest(self) -> Float[Array, "m *lanes"]:
+    def largest_in_rows(self) -> Float[Array, "m *lanes"]:
         """The absolute value of the largest element of each row."""
 
     @abc.abstractmethod
-    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
-        """The absolute value of the largest element of each of `n` columns."""
+    def largest_in_columns(self) -> Float[Array, " n"]:
+        """The absolute value of the largest element of each column."""
 
     @abc.abstractmethod
     def apply(self: Rows, linear: Callable[[Array], Array], n: int) -> Rows:
@@ -105,9 +105,9 @@ class AbstractRows(eqx.Module):
         they do not in usual units, so there the scales are one, which saves time.
         """
         if self.dtype == jnp.float64:
-            like = jax.eval_shape(self.largest)  # with the lanes, if they are the last axis
+            like = jax.eval_shape(self.largest_in_rows)  # with the lanes, if they are the last axis
             return jnp.ones(like.shape, like.dtype), self
-        row_scales = self.largest()
+        row_scales = self.largest_in_rows()
         row_scales = jnp.where(row_scales > 0, row_scales, 1)
         return row_scales, self.divide_rows(row_scales)
 
@@ -133,8 +133,8 @@ class AbstractGram(eqx.Module):
     """A square matrix `U Vᵀ`. It need not be symmetric, as `U` and `V` may differ.
 
     A matrix of up to four rows drops pivots of at most `pivot_tolerance`, by default roundoff;
-    its `factorise` uses this default always. A larger one adds it to its unit diagonal, by default
-    `diagonal_shift`. A sparse one does not use it.
+    its `factorise` uses this default always. A larger one adds this share of its diagonal to it, by
+    default `diagonal_shift`. A sparse one does not use it.
     """
 
     @abc.abstractmethod
@@ -167,7 +167,7 @@ class AbstractGram(eqx.Module):
 
 @final
 class DenseRows(AbstractRows):
-    """Rows as a matrix, alone or with the lanes of a batch as the last axis."""
+    """Rows as a matrix. For scaling, the lanes of a batch may be its last axis."""
 
     matrix: Float[Array, "m n *lanes"]
 
@@ -181,7 +181,7 @@ class DenseRows(AbstractRows):
         return _transposed_product(multiplier, self.matrix)
 
     def gram(self, others: "DenseRows") -> "PivotedGram | RegularisedGram":
-        if len(self) > MAX_UNROLLED:
+        if len(self) > MAX_PIVOTED:
             product = jnp.matmul(self.matrix, others.matrix.T, precision=lax.Precision.HIGHEST)
             return RegularisedGram(product)
         return PivotedGram(jnp.sum(self.matrix[:, None, :] * others.matrix[None], axis=2))
@@ -192,11 +192,10 @@ class DenseRows(AbstractRows):
     def divide_rows(self, row_scales: Float[Array, "m *lanes"]) -> "DenseRows":
         return DenseRows(self.matrix / row_scales[:, None])
 
-    def largest(self) -> Float[Array, "m *lanes"]:
+    def largest_in_rows(self) -> Float[Array, "m *lanes"]:
         return jnp.max(jnp.abs(self.matrix), axis=1)
 
-    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
-        del n
+    def largest_in_columns(self) -> Float[Array, " n"]:
         return jnp.max(jnp.abs(self.matrix), axis=0)
 
     def apply(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
@@ -229,8 +228,8 @@ class PivotedGram(_DenseGram):
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         del pivot_tolerance
         tolerance = roundoff_pivot_tolerance(self.matrix.dtype)
-        factors = gauss_jordan(self.matrix, pivot_tolerance=tolerance, ordered=True)
-        return jtu.Partial(gauss_jordan_solution, *factors)
+        factors = ldu_factors(self.matrix, pivot_tolerance=tolerance, pivoting=True)
+        return jtu.Partial(ldu_solution, *factors)
 
     def solve(
         self, b: Float[Array, " m"], *, pivot_tolerance: float | Array | None = None
@@ -262,9 +261,10 @@ class RegularisedGram(_DenseGram):
 
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
         added = diagonal_shift(self.matrix) if pivot_tolerance is None else pivot_tolerance
-        if len(self.matrix) <= MAX_BLOCK:
-            factors, _ = gauss_jordan(self.matrix, added=added)
-            return jtu.Partial(gauss_jordan_solution, factors, given_order(len(factors), []))
+        if len(self.matrix) <= MAX_ELIMINATION:
+            matrix = self.matrix.astype(np.promote_types(self.matrix.dtype, np.float32))
+            factors, _ = ldu_factors(matrix, added=added)
+            return jtu.Partial(ldu_solution, factors, natural_order(len(factors), []))
         # To invert larger factors takes longer than the few substitutions of a step.
         matrix, equilibration = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
@@ -285,23 +285,23 @@ class _Equilibrated(eqx.Module):
 
 
 def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"]]:
-    """The matrix with its rows and columns multiplied by factors such that the diagonal is one, and
-    the factors."""
+    """The matrix with its rows and columns multiplied by factors such that the diagonal is one in
+    size, or zero where it was, and the factors."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
     equilibration = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
     return matrix * equilibration[:, None] * equilibration, equilibration
 
 
 def _transposed_product(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:
-    """`rowsᵀ x`. A short sum is written out, so that XLA fuses it with what is around it."""
-    if len(rows) > MAX_UNROLLED:
+    """`rowsᵀ x`. A short sum is a reduction, which XLA fuses with what is around it."""
+    if len(rows) > MAX_PIVOTED:
         return jnp.matmul(x, rows, precision=lax.Precision.HIGHEST)
     return jnp.sum(x[:, None] * rows, axis=0)
 
 
 def solve_dense(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """`matrix⁻¹ b`."""
-    return (PivotedGram(matrix) if len(b) <= MAX_UNROLLED else RegularisedGram(matrix)).solve(b)
+    return (PivotedGram(matrix) if len(b) <= MAX_PIVOTED else RegularisedGram(matrix)).solve(b)
 
 
 def solve_kkt(n: int, matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:

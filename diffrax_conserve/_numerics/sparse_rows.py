@@ -53,11 +53,11 @@ class SparseRows(AbstractRows):
     def scale_columns(self, x: Float[Array, " n"]) -> "SparseRows":
         return SparseRows(self.colours * x[self.pattern.active], self.dense * x, self.pattern)
 
-    def largest(self) -> Float[Array, " m"]:
+    def largest_in_rows(self) -> Float[Array, " m"]:
         largest = jnp.max(jnp.abs(take(self.colours, self.pattern.elements)), axis=2)
         return self.pattern.joined(largest, jnp.max(jnp.abs(self.dense), axis=1))
 
-    def largest_in_columns(self, n: int) -> Float[Array, " n"]:
+    def largest_in_columns(self) -> Float[Array, " n"]:
         dense = jnp.max(jnp.abs(self.dense), axis=0, initial=0)
         return dense.at[self.pattern.active].max(jnp.max(jnp.abs(self.colours), axis=0))
 

@@ -27,8 +27,8 @@ class SimplifiedNewton(AbstractNewton):
     after six iterations, the plane of the corrections may miss the manifold, as on a circular
     orbit: from then on the corrections are along the gradients at each state. With more than four
     the matrix is that at the candidate, factored once, as in the simplified Newton iteration, and
-    with up to sixteen, after six iterations, that at each state. So after a long step it takes more
-    iterations, and fails sooner. For candidates far away use
+    after six iterations that at each state, or with more than sixteen at each sixth. So after a
+    long step it takes more iterations, and fails sooner. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
     The derivative, by the implicit function theorem for $\lambda$, is that of a projection along

@@ -32,7 +32,7 @@ from .failure import (
     masked_step,
     starts_off_manifold,
 )
-from .state import State, StepEnd, initial_values, updated_units
+from .state import State, StepFingerprint, initial_values, updated_units
 from .statistics import ProjectionStatistics
 from .target import Path, TargetManifold
 from .terms import (
@@ -200,7 +200,7 @@ class ManifoldProjection(ForwardingSolver):
             if has_rates(self.manifold)
             else None,
             units=jnp.zeros_like(y),
-            last_end=StepEnd.before_first(self.manifold, y.dtype),
+            last_fingerprint=StepFingerprint.before_first(self.manifold, y.dtype),
             statistics=statistics,
             displacements=first_displacements(terms, t0, t1, y0, args)
             if self.keep_linear
@@ -241,7 +241,7 @@ class ManifoldProjection(ForwardingSolver):
             state,
             inner=wrapped.inner,
             rate_integrals=target.rate_integrals,
-            last_end=state.last_end.moved(step.t1, y1, args, self.manifold),
+            last_fingerprint=state.last_fingerprint.at(step.t1, y1, args, self.manifold),
             statistics=state.statistics.add(info, error_norm),
         )
         error = error_for_controller(cause, is_final, wrapped.error)
@@ -332,7 +332,7 @@ class ManifoldProjection(ForwardingSolver):
             displacements=displacements,
         )
         state = dataclasses.replace(state, units=units, displacements=displacements)
-        return state, target.balanced(step.t0, step.y0)
+        return state, target.with_balances_met(step.t0, step.y0)
 
     def _failure(
         self,
@@ -356,7 +356,7 @@ class ManifoldProjection(ForwardingSolver):
             limit = jnp.asarray(self.max_correction, correction.dtype)
             limit = limit * step_norm(step.y0, candidate, metric)
             too_far = metric.norm(correction) > limit
-        is_first_step = jnp.isinf(state.last_end.checksums[0])
+        is_first_step = jnp.isinf(state.last_fingerprint.checksums[0])
         return failure_cause(
             info.ok,
             cannot_start,
@@ -375,7 +375,9 @@ class ManifoldProjection(ForwardingSolver):
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         if all(entry.value is not None for _, entry in named_entries(self.manifold)):
             return invalid_values
-        changed = state.last_end.differs(step.t0, step.y0, target.args, self.manifold) | made_jump
+        changed = (
+            state.last_fingerprint.differs(step.t0, step.y0, target.args, self.manifold) | made_jump
+        )
         off = lax.cond(
             any_lane(changed),
             lambda: starts_off_manifold(target.problem(step.t0, step.y0), self.manifold, step.y0),

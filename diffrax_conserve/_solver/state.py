@@ -33,7 +33,7 @@ class State(eqx.Module):
     - `rate_integrals`: as in a `TargetManifold`.
     - `units`: the unit of each component in the metric of motion, see `updated_units`, the largest
       of all steps so far; zero before the first step.
-    - `last_end`: the end of the last step.
+    - `last_fingerprint`: the end of the last step.
     - `displacements`: those in the last two steps, as in a `TargetManifold`; `None` unless linear
       invariants are kept.
     """
@@ -42,7 +42,7 @@ class State(eqx.Module):
     packed_constants: Float[Array, " constants"]
     rate_integrals: Float[Array, "2 m"] | None
     units: Float[Array, " n"]
-    last_end: "StepEnd"
+    last_fingerprint: "StepFingerprint"
     statistics: ProjectionStatistics
     displacements: Float[Array, "k n"] | None
 
@@ -59,10 +59,10 @@ class State(eqx.Module):
         return self.packed_constants[-1]
 
 
-class StepEnd(eqx.Module):
+class StepFingerprint(eqx.Module):
     """The end of a step. A step that starts there, with the same `args` and manifold, needs no test
-    of its start. The first step of a solve has one, also of a solve that goes on from a solver
-    state with other values.
+    of its start. The first step of a solve has such a test, also of a solve that goes on from a
+    solver state with other values.
 
     - `checksums`: the checksums of the state and of all numbers in `args` and in the manifold, and
       the time; infinite before the first step. They are one array, as `packed_constants` are.
@@ -73,21 +73,21 @@ class StepEnd(eqx.Module):
     manifold_hash: int = eqx.field(static=True)
 
     @classmethod
-    def before_first(cls, manifold: Manifold, dtype: Any) -> "StepEnd":
+    def before_first(cls, manifold: Manifold, dtype: Any) -> "StepFingerprint":
         return cls(jnp.full(3, jnp.inf, dtype), hash_of(manifold))
 
-    def moved(
+    def at(
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
-    ) -> "StepEnd":
+    ) -> "StepFingerprint":
         sums, _ = self._checksums(t, y, args, manifold)
         return dataclasses.replace(self, checksums=sums)
 
     def differs(
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
     ) -> Bool[Array, ""]:
-        """Whether it is another one than that of these values. XLA may add in another order, so
-        sums are compared up to roundoff. For a state that is NaN the comparison is false, and its
-        projection fails."""
+        """Whether these values are of another state, time, `args` or manifold. XLA may add in
+        another order, so sums are compared up to roundoff. For a state that is NaN the comparison
+        is false, and its projection fails."""
         if self.manifold_hash != hash_of(manifold):
             return jnp.asarray(True)
         sums, sizes = self._checksums(t, y, args, manifold)

@@ -70,7 +70,7 @@ class TargetManifold(eqx.Module):
             self, rate_integrals=jnp.stack([total, (total - last) - increment])
         )
 
-    def balanced(self, t: RealScalarLike, y: Float[Array, " n"]) -> "TargetManifold":
+    def with_balances_met(self, t: RealScalarLike, y: Float[Array, " n"]) -> "TargetManifold":
         """The target with balances that hold at a state `y`, the start of a step, up to half of
         what counts as noise.
 

@@ -16,7 +16,7 @@ from .._constants import MAX_STEPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
-from .._numerics.iterate import iterate, left_after_test, where_active
+from .._numerics.iterate import iterate, remaining_after_test, where_active
 from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
 from .._numerics.rows import solve_dense
 from .._projection.closed_form import ClosedForm
@@ -209,7 +209,7 @@ def _balanced(rows: Rows, y: State, target: Float[Array, " balances"]) -> State:
     def advance(multiplier: Array, tests_left: Array) -> tuple[Array, Array]:
         left = missing(multiplier)
         met = jnp.all(jnp.abs(left) <= small * jnp.abs(target))
-        tests_left = left_after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), tests_left)
+        tests_left = remaining_after_test(jnp.where(met, AT_ROUNDOFF, ABOVE_TOLERANCE), tests_left)
         gram = jnp.sum(weights[:, None, :] * weights * state(multiplier), axis=2)
         change = solve_dense(gram, left)
         # An exponent changes by at most one in a step.

@@ -177,7 +177,7 @@ SLOW = ("simplified", 3), ("newton", 1)
 def test_a_derivative_near_parallel_gradients_is_that_of_the_flow(name, repeated):
     """The orbit differs by 1e-7. The angle between the gradients, about the eccentricity, would
     amplify that in the derivative, up to a loss of all digits. Of `Newton` it may be NaN. Integrals
-    that are repeated are more than four constraints, which are not eliminated in scalars."""
+    that are repeated are more than four constraints, which are eliminated without pivoting."""
     rng = np.random.default_rng(0)
     e = np.concatenate([[0.0], 10.0 ** rng.uniform(-14, -1, 399)])
     direction = rng.normal(size=(400, 4))

@@ -118,7 +118,7 @@ def test_in_float32_what_is_lost_in_a_step_is_not_lost_to_roundoff():
     options = dict(manifold=None, solver=dfx.Dopri8()) | PRECISE
     exact = solve(args=(jnp.array(1e-6), jnp.array(0.0)), t1=200.0, **options)
     lost = float(energy(0, last_of(exact), None) - energy(0, Y0, None))
-    # The value follows a state that is off by roundoff, see `TargetManifold.balanced`.
+    # The value follows a state that is off by roundoff, see `TargetManifold.with_balances_met`.
     assert gained == pytest.approx(lost, rel=0.1)  # without the second row nothing is gained
 
 

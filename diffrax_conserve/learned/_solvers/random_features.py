@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._numerics.implicit import root
-from ..._numerics.iterate import Solved, iterate, left_after_step, where_active
+from ..._numerics.iterate import Solved, iterate, remaining_after_step, where_active
 from ..._projection.options import check_state, refuse_half_precision
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
@@ -219,7 +219,7 @@ def _newton(equations: StepEquations, start: Coefficients) -> Solved:
         change = equations.solve_linear(equations.jacobians(states), residual)
         size = jnp.max(jnp.abs(equations.states(change) - equations.y0))
         converged = size <= tolerance * jnp.max(jnp.abs(states))
-        then = left_after_step(converged, jnp.isfinite(size), tests_left)
+        then = remaining_after_step(converged, jnp.isfinite(size), tests_left)
         return where_active(tests_left, coefficients - change, coefficients), then
 
     found = iterate(advance, start, max_steps=_MAX_STEPS)
