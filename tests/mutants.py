@@ -115,9 +115,9 @@ def divide_by_the_length_of_a_step_that_has_none(package):
 
 
 def call_nan_a_success(package):
-    @package.around("Problem.level")
-    def _(level, self, *values):
-        return level(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
+    @package.around("Problem.status")
+    def _(status, self, *values):
+        return status(self, *(jnp.where(jnp.isfinite(x), x, 0) for x in values))
 
 
 def take_the_conserved_value_anew_at_every_step(package):
