@@ -179,7 +179,7 @@ def test_what_is_too_large_has_an_effect_or_random_numbers_is_not_written_out():
     assert scalarised(lambda y: y + jr.normal(jr.key(0)), jnp.ones(3)) is None
 
 
-LANES = 7
+LANES = 11
 
 
 def innermost_loops(jaxpr):
@@ -194,14 +194,14 @@ def loops_of(eqn):
     return [loop for jaxpr in inner for loop in innermost_loops(jaxpr) if loop is not jaxpr]
 
 
-# The systems whose projections are not written out: ten and five integrals are too many, and the
-# waves have too many operations.
-IN_ARRAYS = {"outer-solar-system", "rigid-body-attitude", "korteweg-de-vries"}
+# The systems whose functions are not written out, because they have too many operations.
+IN_ARRAYS = {"outer-solar-system", "korteweg-de-vries"}
 
 
 @some_of("name", dfc.systems.names(), ids=dfc.systems.names(), period=7)
 def test_the_projections_of_the_catalogue_are_written_out_in_a_batch(name):
-    """Scalars have the lanes as their only axis."""
+    """Scalars have the lanes as their only axis, and what is computed for all lanes together has
+    them as the last. Only a branch passes on arrays with the lanes first, such as the metric."""
     system = dfc.systems.get(name)
     term = dfx.ODETerm(system.vector_field)
 
@@ -213,7 +213,7 @@ def test_the_projections_of_the_catalogue_are_written_out_in_a_batch(name):
     of_lanes = lambda aval: aval.ndim > 1 and aval.shape[0] == LANES  # noqa: E731
     loops = innermost_loops(jax.make_jaxpr(jax.vmap(solve))(ys).jaxpr)
     arrays = set().union(*(names_of_arrays(loop, of_lanes) for loop in loops))
-    assert bool(arrays) == (name in IN_ARRAYS)
+    assert bool(arrays - {"cond"}) == (name in IN_ARRAYS)
 
 
 # ---- What `print` shows of the records of the package ----
