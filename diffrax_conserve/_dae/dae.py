@@ -675,7 +675,7 @@ def _consistent(
     if moves is None and structure.index == 1:
         found = unravel(_solved_for(dae, t, y, args, algebraic_newton)[0], y)
         return found, tree_all_finite(found)
-    units = structure.units(jnp.ones_like(ravel(y)))
+    units = structure.units(ravel(y).dtype)
     if moves is not None:
         units = jnp.where(moves, units, 0)
     none = jnp.zeros(sum(len(structure.left(k)) for k in range(structure.index)), units.dtype)

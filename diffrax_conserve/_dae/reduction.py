@@ -121,20 +121,20 @@ class Structure:
         known = set(self.rounds[-1].slopes if self.rounds else range(self.size))
         return tuple(j for j in range(self.size) if j not in known)
 
-    def units(self, sizes: Float[Array, " n"]) -> Float[Array, " n"]:
+    def units(self, dtype: Any) -> Float[Array, " n"]:
         """The units of a projection in which unknowns without slopes, such as forces, are free:
-        what they can correct moves no other unknown."""
-        some = jnp.where(sizes > 0, sizes, 1)
-        return jnp.where(self._is_free, some / eps_of(sizes), sizes)
+        what they can correct moves no other unknown. Those of the others are one."""
+        return jnp.where(self._is_free, jnp.asarray(1 / eps_of(dtype), dtype), 1)
 
     def equilibrated_units(
         self, sizes: Float[Array, " n"], jacobian: AbstractRows
     ) -> Float[Array, " n"]:
-        """As `units`, for a constraint Jacobian. The sizes of unknowns without slopes are not used:
-        they may have any ratios, as at a start where some vanish, and a Gram matrix would square
-        these. Their units are such that the largest element in the column of each is one, where the
-        largest element of each row is one; and all are so large that in each row that has
-        one, one exceeds what the other unknowns contribute by the factor `1/ε`."""
+        """As `units`, for a constraint Jacobian. The units of unknowns with slopes are their sizes.
+        The sizes of those without slopes may have any ratios, as at a start where some
+        vanish, and a Gram matrix would square these. So the units of these unknowns come from the
+        Jacobian, equilibrated as by LAPACK's `geequ`: first each row is divided by its largest
+        element, then each column. All are so large that they exceed in each row that has some what
+        the other unknowns contribute, by the factor `1/ε`."""
         others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest_in_rows()
         free = jacobian.scale_columns(jnp.asarray(self._is_free, sizes.dtype))
         largest = free.largest_in_rows()

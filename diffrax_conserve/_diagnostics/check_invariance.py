@@ -40,7 +40,8 @@ Entry = FirstIntegral | Constraint
 
 # By default a defect of this many units of roundoff counts as roundoff. The number is a choice: the
 # roundoff of a derivative grows with the number of operations, and a wrong integral has a defect of
-# order one at almost every state. In half precision a tenth of that is less.
+# order one at almost every state. In half precision so many units
+# are more than one, so that there a tenth of order one is the limit.
 _ROUNDOFF, _LEAST_DEFECT = 1e4, 0.1
 # The distance to another state at which a derivative is looked at too, as a share of each
 # component.

@@ -69,7 +69,7 @@ Advance = Callable[[Any, Array], tuple[Any, Array]]
 
 
 class Solved(NamedTuple):
-    """What an iteration has solved.
+    """What an iteration returns.
 
     - `y`: the unknowns. In a projection they are the state.
     - `ok`: whether they solve the equations.

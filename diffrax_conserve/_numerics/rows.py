@@ -289,7 +289,7 @@ def _equilibrated(matrix: Float[Array, "m m"]) -> tuple[Array, Float[Array, " m"
     size, or zero where it was, and the factors."""
     diagonal = jnp.abs(jnp.diagonal(matrix))
     equilibration = lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    return matrix * equilibration[:, None] * equilibration, equilibration
+    return matrix * equilibration[:, None] * equilibration[None], equilibration
 
 
 def _transposed_product(x: Float[Array, " m"], rows: Float[Array, "m n"]) -> Float[Array, " n"]:

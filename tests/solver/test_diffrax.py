@@ -322,9 +322,11 @@ def test_a_stochastic_term_of_ones_own_class_changes_nothing():
     np.testing.assert_array_equal(solved(term), solved(OwnTerm(term)))
 
 
-@pytest.mark.parametrize(("m", "dtype"), [(1, "float64"), (3, "float32"), (6, "float64")])
+@pytest.mark.parametrize(
+    ("m", "dtype"), [(1, "float64"), (3, "float32"), (6, "float64"), (20, "float32")]
+)
 def test_strict_promotion_and_rank_promotion(m, dtype):
-    """Alone and in a batch, for each way in which few constraints are solved."""
+    """Alone and in a batch, for each way in which dense constraints are solved."""
 
     def squares(t, y, args):
         return jnp.sum(y**2)[None] * jnp.arange(1.0, m + 1, dtype=y.dtype)
