@@ -148,12 +148,26 @@ def updated_units(
     """
     size = largest_of_quantity(jnp.maximum(jnp.abs(end), change), like)
     change = largest_of_quantity(change, like)
-    # Without the constant the derivative of the quotient would divide by a square, which underflows
-    # where links of a chain at rest are moved by the noise of the others.
+    # Without the constant the derivative of the quotient would divide by a square, which may
+    # underflow, as behind a front that has not arrived.
     constant = lax.stop_gradient(jnp.where(size > 0, size, 1))
     ratio = (change / constant) / jnp.where(size > 0, size / constant, 1)
     ratio = jnp.maximum(ratio, eps_of(change))
-    return jnp.maximum(units, size * jnp.sqrt(ratio))
+    return with_least_units(jnp.maximum(units, size * jnp.sqrt(ratio)), like)
+
+
+def with_least_units(units: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
+    """The units, of which none is below `ε` times the largest of its leaf, if a leaf of a state of
+    several leaves holds many vectors.
+
+    If the last link of a chain at rest is pushed, the others begin to move with high powers of
+    time, by 1e-70 for example. With such a unit the derivative would be wrong: its roundoff, which
+    no number of size one absorbs, would be corrected in whatever has the larger unit.
+    """
+    leaves = jtu.tree_leaves(like)
+    if len(leaves) == 1 or all(x.ndim < 2 for x in leaves):
+        return units
+    return jnp.maximum(units, eps_of(units) * _largest(units, like, None))
 
 
 def largest_of_quantity(x: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
@@ -165,12 +179,16 @@ def largest_of_quantity(x: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
     such as the position of a body, is one quantity, because with different units for its components
     corrections would turn it. A single array may hold unlike quantities.
     """
+    return _largest(x, like, -1)
+
+
+def _largest(x: Float[Array, " n"], like: Any, axis: int | None) -> Array:
     if len(jtu.tree_leaves(like)) == 1:
         return x
 
     def largest(part: Array) -> Array:
-        axis = -1 if part.ndim else None
-        most = jnp.max(part, axis=axis, keepdims=True, initial=0)
+        along = axis if part.ndim else None
+        most = jnp.max(part, axis=along, keepdims=True, initial=0)
         return jnp.broadcast_to(most, part.shape)
 
     return ravel(jtu.tree_map(largest, unflatten(x, jax.eval_shape(real_view, like))))
