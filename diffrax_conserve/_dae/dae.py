@@ -42,9 +42,9 @@ from .newton import (
     MAX_NEWTON_STEPS,
     SparseNewton,
     algebraic_newton,
-    divided,
     error_oriented_newton,
     least_exact,
+    solve_equilibrated,
 )
 from .radau import Radau
 from .reduction import Implicit, Reduction, Singular, Structure
@@ -227,7 +227,7 @@ class DAE(Hashable):
                     "`wrap` makes a projected solver of one that is not: pass "
                     "`diffrax_conserve.Radau()` itself."
                 )
-            solver = dataclasses.replace(solver, _equations=_Stages(self))
+            solver = dataclasses.replace(solver, _equations=_IndexOneEquations(self))
         kept: dict[str, Any] = {"equations": Constraint(_Constraints(self))}
         back: AbstractProjection = ConstraintProjection(dae=self)
         if projection is not None or named_entries(manifold):
@@ -314,7 +314,7 @@ class DAE(Hashable):
         structure = _checked_structure(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
         equations, unknowns = self._names(t, y, args), _names("y", y)
-        times = structure.times
+        times = structure.num_differentiations
         off = RunOnce(eqx.filter_jit, _Constraints(self))(t, y, args)[: structure.index]
         return DAEReport(
             index=structure.index,
@@ -693,7 +693,7 @@ def _consistent(
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.
-    stages = structure.stages(freely=moves is None)
+    stages = structure.search_stages(freely=moves is None)
     found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
     return found, ok[-1]
 
@@ -707,7 +707,7 @@ def _solved_for(
     structure, t, state = _at(dae, t, state, args)
     y = ravel(state)
     reduction = Reduction(structure, dae._equations(t, state, args), t, y)
-    along, free = reduction.freely_moved(t, y)
+    along, free = reduction.mass_null_space(t, y)
     fits = reduction.fits(t, y)
 
     def moved(z: Array) -> Array:
@@ -719,7 +719,7 @@ def _solved_for(
     residual = reduction.small(residual, y[free])
     large = structure.large
     if large is None or large.by_free is None or free.size < MIN_KLU:
-        found = root(residual, ft.partial(newton, residual), y[free], divided)
+        found = root(residual, ft.partial(newton, residual), y[free], solve_equilibrated)
     else:
         sparse = SparseNewton(large.by_free)
         newton = ft.partial(newton, residual, sparse=sparse)
@@ -757,7 +757,7 @@ class _Constraints(eqx.Module):
 
 
 @final
-class _Stages(eqx.Module):
+class _IndexOneEquations(eqx.Module):
     """The equations that [`diffrax_conserve.Radau`][] solves, of index 1 at most."""
 
     dae: DAE
@@ -773,7 +773,7 @@ class _Stages(eqx.Module):
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
         given = _at(self.dae, t, y, args)
-        return _value(Reduction.stages, self.dae, given, args, ravel(slopes))
+        return _value(Reduction.index_one_equations, self.dae, given, args, ravel(slopes))
 
 
 def _at(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> tuple[Structure, Array, Y]:

@@ -98,12 +98,12 @@ def find_large_structure(
     none = np.zeros(0, int)
     selected = extended(matrix, (none, none))
     first = np.setdiff1d(np.arange(n), selected[0])
-    apart = not (matrix[first].nnz or other[first].nnz)
+    is_semi_explicit = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
     structure = Structure(
-        n, (), is_linear, mass, apart, without_slopes=_tuple(without), large=large
+        n, (), is_linear, mass, is_semi_explicit, without_slopes=_tuple(without), large=large
     )
-    seen, brought, met, needed = np.zeros(n, bool), [], [], none
+    seen, new_unknowns, met, needed = np.zeros(n, bool), [], [], none
     in_places = by_slope.rows, by_slope.columns
     gradients = sp.csr_array((0, n))
     while len(selected[0]) < n:
@@ -113,7 +113,12 @@ def find_large_structure(
         if structure.index == MAX_INDEX:
             raise NotFound(f"their index is larger than {MAX_INDEX}")
         one = Round(*map(_tuple, selected))
-        kind = structure.is_linear, structure.mass is None, structure.apart, _pattern(matrix)
+        kind = (
+            structure.is_linear,
+            structure.mass is None,
+            structure.is_semi_explicit,
+            _pattern(matrix),
+        )
         further = ft.partial(_with_round, structure, selected, matrix, needed)
         large = once((structure, one, *kind), further)
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, one), large=large)
@@ -127,8 +132,8 @@ def find_large_structure(
             at = once(last, ft.partial(places.of, last.constraints, 1, n))
             new = _matrix(at, last.values(at, numbers, t, y))
         contained = ~_empty(new, 0)
-        brought.append(np.flatnonzero(contained & ~seen))
-        met.append(len(extended(new[:, brought[-1]], (none, none))[0]) == len(left))
+        new_unknowns.append(np.flatnonzero(contained & ~seen))
+        met.append(len(extended(new[:, new_unknowns[-1]], (none, none))[0]) == len(left))
         seen |= contained
         gradients = sp.csr_array(sp.vstack([gradients, new]))
         independent = extended(gradients, (none, none))[0]
@@ -145,7 +150,7 @@ def find_large_structure(
     large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
     structure = dataclasses.replace(structure, large=large)
     if all(met):
-        structure = dataclasses.replace(structure, brought=tuple(map(_tuple, brought)))
+        structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
     return structure
 
 
@@ -221,7 +226,7 @@ def _with_round(
     constant = structure.is_linear and structure.mass is not None
     if k == 0:
         large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
-        if structure.apart:
+        if structure.is_semi_explicit:
             return large
         if not constant:
             raise NotFound(

@@ -23,15 +23,17 @@ MAX_NEWTON_STEPS = 500
 Residual = Callable[[Array], Array]
 
 
-def divided(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
+def solve_equilibrated(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
     """`matrix⁻¹ b`, computed in units in which all elements are about one."""
     if b.size == 1:
         return b / matrix[0]
-    rows, columns = lax.stop_gradient(_sizes(matrix))
+    rows, columns = lax.stop_gradient(_row_and_column_scales(matrix))
     return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
 
 
-def _sizes(jacobian: Float[Array, "m m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def _row_and_column_scales(
+    jacobian: Float[Array, "m m"],
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """The units of equations and unknowns, in which no entry is larger than one."""
     rows = jnp.max(jnp.abs(jacobian), axis=1)
     return rows, jnp.max(jnp.abs(jacobian) / rows[:, None], axis=0)
@@ -50,7 +52,7 @@ class _Factored(NamedTuple):
     @classmethod
     def at(cls, residual: Residual, z: Float[Array, " m"]) -> "_Factored":
         jacobian = jax.jacfwd(residual)(z)
-        rows, columns = _sizes(jacobian)
+        rows, columns = _row_and_column_scales(jacobian)
         scaled = jacobian / rows[:, None] / columns
         one = scaled, jnp.zeros(1, jnp.int32)
         return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns, jacobian)

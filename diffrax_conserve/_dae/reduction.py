@@ -33,7 +33,7 @@ from .._numerics.implicit import root
 from .._numerics.rows import AbstractRows
 from .._tree import eps_of, irregular_weights
 from .large import Large
-from .newton import SparseNewton, algebraic_newton, divided
+from .newton import SparseNewton, algebraic_newton, solve_equilibrated
 
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
@@ -57,11 +57,11 @@ class Structure:
     - `rounds`: for each differentiation, what is solved for what before it.
     - `is_linear`: whether the equations are linear in the slopes.
     - `mass`: `∂F/∂y'`, if it is known to be constant.
-    - `apart`: whether the equations that are left first contain no slopes, not even some that
-      cancel.
-    - `brought`: for each differentiation the unknowns that its constraints contain and those before
-      do not, such as positions, velocities and forces; empty if not all constraints can be met by
-      these alone.
+    - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
+      that cancel.
+    - `new_unknowns`: for each differentiation the unknowns that its constraints contain and those
+      before do not, such as positions, velocities and forces; empty if not all constraints can be
+      met by these alone.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
@@ -70,8 +70,8 @@ class Structure:
     rounds: tuple[Round, ...]
     is_linear: bool
     mass: Any = None
-    apart: bool = False
-    brought: tuple[tuple[int, ...], ...] = ()
+    is_semi_explicit: bool = False
+    new_unknowns: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
     large: Large | None = None
 
@@ -94,10 +94,10 @@ class Structure:
     @property
     def ranks(self) -> tuple[int, ...]:
         """For how many slopes the equations are solved before each differentiation."""
-        return tuple(len(round.slopes) for round in self.rounds)
+        return tuple(len(one.slopes) for one in self.rounds)
 
     @property
-    def times(self) -> tuple[int, ...]:
+    def num_differentiations(self) -> tuple[int, ...]:
         """How often each equation is differentiated."""
         lefts = [set(self.left(k)) for k in range(self.index)]
         return tuple(sum(i in left for left in lefts) for i in range(self.size))
@@ -105,7 +105,7 @@ class Structure:
     @property
     def freedom(self) -> int:
         """The number of degrees of freedom."""
-        return self.size - sum(self.times)
+        return self.size - sum(self.num_differentiations)
 
     def __str__(self) -> str:
         return f"index {self.index} and {self.freedom} degrees of freedom"
@@ -148,10 +148,10 @@ class Structure:
     def _is_free(self) -> Bool[np.ndarray, " n"]:
         return np.isin(np.arange(self.size), self.algebraic)
 
-    def stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
+    def search_stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are
         asked for, and which unknowns move. In the last two all are asked for, and all move."""
-        alone = self.brought if freely else ()
+        alone = self.new_unknowns if freely else ()
         asked = [np.arange(self.index) == k for k in range(len(alone))]
         moving = [np.isin(np.arange(self.size), found) for found in alone]
         last = np.full((2, self.index), True), np.full((2, self.size), True)
@@ -184,7 +184,7 @@ class Reduction:
         if k == 0 and large is not None and large.combinations is not None:
             combinations = large.combinations
             return lambda t, y: [combinations @ equations(t, y, jnp.zeros_like(y))]
-        none = k == 0 and structure.apart  # such equations contain no slopes
+        none = k == 0 and structure.is_semi_explicit  # such equations contain no slopes
         slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
         if k == 0:
             return lambda t, y: [equations(t, y, slopes(t, y))[left]]
@@ -225,9 +225,11 @@ class Reduction:
             elif structure.is_linear:
                 both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
                 matrix, value = both(begin)
-                found = divided(matrix, -value)
+                found = solve_equilibrated(matrix, -value)
             else:
-                found = root(residual, ft.partial(algebraic_newton, residual), begin, divided).y
+                found = root(
+                    residual, ft.partial(algebraic_newton, residual), begin, solve_equilibrated
+                ).y
             return jnp.zeros_like(y).at[columns].set(found)
 
         return small(slopes, *self.like)
@@ -256,7 +258,7 @@ class Reduction:
 
         return slopes
 
-    def stages(self, t: Array, y: Array, slopes: Array) -> Array:
+    def index_one_equations(self, t: Array, y: Array, slopes: Array) -> Array:
         """`F_{ν-1}`, the equations after all differentiations but the last."""
 
         def differentiated(t: Array, y: Array, slopes: Array) -> Array:
@@ -272,7 +274,7 @@ class Reduction:
             values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
 
-    def freely_moved(self, t: Array, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
+    def mass_null_space(self, t: Array, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""
@@ -303,9 +305,9 @@ class Reduction:
             left = np.isin(by_slope.rows, structure.left(0))
             return ~jnp.any(values[left])
         left = self._by_slopes(t, y)[np.array(structure.left(0), int)]
-        if structure.apart:
+        if structure.is_semi_explicit:
             return ~jnp.any(left)
-        along, _ = self.freely_moved(t, y)
+        along, _ = self.mass_null_space(t, y)
         least = eps_of(y) ** REGULARISATION_POWER
         return jnp.all(jnp.abs(left @ along) <= least * (jnp.abs(left) @ jnp.abs(along)))
 
@@ -369,9 +371,9 @@ def find_structure(
     rest = np.delete(both, selected.equations, axis=1)
     without = tuple(np.flatnonzero(~both.any((0, 1))).tolist())
     structure = Structure(
-        y.size, (), is_linear, mass, apart=not np.any(rest), without_slopes=without
+        y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
     )
-    brought, met = [], []
+    new_unknowns, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         before = known.rounds[structure.index :] if known is not None else ()
         if before and len(before[0].slopes) == len(selected.slopes):
@@ -379,8 +381,8 @@ def find_structure(
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         new = np.asarray(_last_gradients(equations, structure, numbers, t, y))
-        brought.append((new != 0).any(0) & ~(gradients != 0).any(0))
-        met.append(len(_extended(new[:, brought[-1]], _NONE).equations) == len(new))
+        new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
+        met.append(len(_extended(new[:, new_unknowns[-1]], _NONE).equations) == len(new))
         gradients = np.concatenate([gradients, new])
         independent = _extended(gradients, _NONE).equations
         if len(independent) < len(gradients):
@@ -389,8 +391,8 @@ def find_structure(
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
     if all(met):
-        found = tuple(tuple(np.flatnonzero(one).tolist()) for one in brought)
-        structure = dataclasses.replace(structure, brought=found)
+        found = tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns)
+        structure = dataclasses.replace(structure, new_unknowns=found)
     return structure
 
 
@@ -435,7 +437,7 @@ def general_states(t: Array, y: Array, share: float) -> tuple[Array, Array, Arra
     return later, moved, size * pattern[:-1].reshape(3, -1)[1:]
 
 
-def _extended(matrix: np.ndarray, round: Round) -> Round:
+def _extended(matrix: np.ndarray, selected: Round) -> Round:
     """The selection with as many more equations and slopes as the rank of the matrix allows, by
     elimination with the largest pivot."""
     matrix = np.array(matrix, float)
@@ -443,7 +445,7 @@ def _extended(matrix: np.ndarray, round: Round) -> Round:
         for axis in (0, 1):
             largest = np.sqrt(np.max(np.abs(matrix), axis=axis, keepdims=True, initial=0))
             matrix = matrix / np.where(largest > 0, largest, 1)
-    rows, columns = list(round.equations), list(round.slopes)
+    rows, columns = list(selected.equations), list(selected.slopes)
     if rows:
         inner = matrix[np.ix_(rows, columns)]
         matrix = matrix - matrix[:, columns] @ np.linalg.solve(inner, matrix[rows])

@@ -304,7 +304,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         not, the matrix is only approximate, and the iterations converge more slowly, to the same
         result."""
         forces = problem.factor.scaled_rows(problem.factor.scaled_rows(jacobian))
-        return jacobian.gram(forces.apply(lambda x: jax.jvp(drift, (p,), (x,))[1], p.size))
+        return jacobian.gram(forces.map_rows(lambda x: jax.jvp(drift, (p,), (x,))[1], p.size))
 
     def _linear(
         self,

@@ -166,7 +166,7 @@ class SymmetricProjection(ForwardingSolver):
         del made_jump
         state, vector = solver_state, ravel(y0)
         _, *times = in_field_time(terms, t0, t1)
-        start, end = (self._problem(t, y0, args, state).dense() for t in times)
+        start, end = (self._problem(t, y0, args, state).with_dense_jacobian() for t in times)
 
         def inner(y: Array) -> tuple[Array, dfx.RESULTS]:
             # A symmetric method has no memory, so we discard the state of the wrapped solver. The

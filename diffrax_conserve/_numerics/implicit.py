@@ -117,7 +117,7 @@ class MultiplierSystem(AbstractSystem):
         where to differentiate: whether a state was found."""
         start = self._start(solved.ok)
         row_norms, rows = self._directions_at(start).normalised()
-        change = self.problem.factor.to_metric(jnp.where(solved.ok, solved.y, start) - start)
+        change = self.problem.factor.to_euclidean(jnp.where(solved.ok, solved.y, start) - start)
         return solved.ok, rows.least_squares_multiplier(change) / row_norms
 
     def equations(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:

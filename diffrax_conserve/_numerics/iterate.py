@@ -232,7 +232,7 @@ def _newton_of_few_constraints(
                 tolerance = _pivot_tolerance(status, rows.dtype)
                 return ldu_factors(matrix, pivot_tolerance=tolerance, pivoting=True)
             shift = jnp.where(frozen, diagonal_shift(rows), roundoff_pivot_tolerance(rows.dtype))
-            return ldu_factors(matrix, added=shift)[:1]
+            return ldu_factors(matrix, relative_shift=shift)[:1]
 
         def refreshed() -> list[Array]:
             new = [rows, *factors_of(rows, rows)]

@@ -77,7 +77,7 @@ def gram_matrix(
 def ldu_factors(
     matrix: Float[Array, "m m *lanes"],
     *,
-    added: float | Array = 0.0,
+    relative_shift: float | Array = 0.0,
     pivot_tolerance: float | Array = 0.0,
     pivoting: bool = False,
 ) -> tuple[Float[Array, "m m *lanes"], Array | np.ndarray]:
@@ -85,8 +85,8 @@ def ldu_factors(
     pivots `D` on it, and `U⁻¹` above it, if rows and columns are in the order of elimination. The
     second result is the step in which each row was the pivot row, and `m` for the row that is left.
 
-    To each element of the diagonal its share `added` is added, and a pivot of at most its share
-    `pivot_tolerance` counts as infinite, so that its multiplier is zero.
+    Each element of the diagonal is multiplied by `1 + relative_shift`, and a pivot of at most its
+    share `pivot_tolerance` counts as infinite, so that its multiplier is zero.
 
     Divided by the element on the diagonal of the matrix, a pivot is the squared sine of the angle
     between the gradient of a constraint and the span of the gradients before it. If `pivoting`, the
@@ -105,8 +105,8 @@ def ldu_factors(
     j = natural_order(m, lanes)
     on_diagonal = j[:, None] == j[None]
     of_lanes = lambda x: jnp.broadcast_to(jnp.asarray(x, matrix.dtype), (1, *lanes))  # noqa: E731
-    added, pivot_tolerance = of_lanes(added), of_lanes(pivot_tolerance)
-    matrix = jnp.where(on_diagonal, matrix + added[None] * matrix, matrix)
+    relative_shift, pivot_tolerance = of_lanes(relative_shift), of_lanes(pivot_tolerance)
+    matrix = jnp.where(on_diagonal, matrix + relative_shift[None] * matrix, matrix)
     size = jnp.abs(_diagonal(matrix))
 
     def pivots_of(matrix: Array) -> Array:

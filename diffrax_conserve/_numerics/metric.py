@@ -52,12 +52,12 @@ class AbstractFactor(eqx.Module):
         """`S change`, for a change in the coordinates in which the metric is Euclidean."""
 
     @abc.abstractmethod
-    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_euclidean(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         """`S⁻¹ change`."""
 
     def norm(self, change: Float[Array, " n"]) -> Float[Array, ""]:
         """The length of a change of the state in the metric."""
-        return jnp.linalg.norm(self.to_metric(change))
+        return jnp.linalg.norm(self.to_euclidean(change))
 
 
 @final
@@ -73,7 +73,7 @@ class Identity(AbstractFactor):
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change
 
-    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_euclidean(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change
 
 
@@ -93,7 +93,7 @@ class Diagonal(AbstractFactor):
     def to_state(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return change * self.diagonal
 
-    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_euclidean(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         moves = self.diagonal != 0
         return jnp.where(moves, change / jnp.where(moves, self.diagonal, 1), 0)
 
@@ -121,9 +121,9 @@ class BlockCholesky(AbstractFactor):
         solve = lambda lower, x: jsp.linalg.solve_triangular(lower, x, 1, lower=True)  # noqa: E731
         return self._on_blocks(solve, self.diagonal_elsewhere.to_state(change))
 
-    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_euclidean(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         product = lambda lower, x: jnp.matmul(x, lower, precision=lax.Precision.HIGHEST)  # noqa: E731
-        return self._on_blocks(product, self.diagonal_elsewhere.to_metric(change))
+        return self._on_blocks(product, self.diagonal_elsewhere.to_euclidean(change))
 
     def _on_blocks(self, fn: Callable[[Array, Array], Array], x: Array) -> Array:
         """`x` with `fn(L, part)` in the place of each part with a matrix."""
@@ -157,7 +157,7 @@ class PreferredSubspace(AbstractFactor):
         first time grows with the ratio of its lengths before and after. If at most a share `δ` of
         the change is new, it is left out: the new part has too few digits to conserve what the
         other changes conserve."""
-        changes = jax.vmap(base_factor.to_metric)(changes)
+        changes = jax.vmap(base_factor.to_euclidean)(changes)
         sizes = jnp.max(jnp.abs(changes), axis=1, keepdims=True)
         changes = changes / jnp.where(sizes > 0, sizes, 1)
         least = _complement_damping(changes.dtype) ** 2
@@ -183,9 +183,9 @@ class PreferredSubspace(AbstractFactor):
             self._damped_complement(change, _complement_damping(change.dtype))
         )
 
-    def to_metric(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
+    def to_euclidean(self, change: Float[Array, " n"]) -> Float[Array, " n"]:
         return self._damped_complement(
-            self.base_factor.to_metric(change), 1 / _complement_damping(change.dtype)
+            self.base_factor.to_euclidean(change), 1 / _complement_damping(change.dtype)
         )
 
     def norm(self, change: Float[Array, " n"]) -> Float[Array, ""]:

@@ -143,7 +143,7 @@ class Problem(eqx.Module):
         """`G(y) S`, the gradients in the coordinates in which the metric is Euclidean."""
         return self.factor.scaled_rows(self.linearise(y)[1])
 
-    def dense(self) -> "Problem":
+    def with_dense_jacobian(self) -> "Problem":
         """The same problem, with the Jacobian computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)
 

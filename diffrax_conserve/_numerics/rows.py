@@ -86,7 +86,7 @@ class AbstractRows(eqx.Module):
         """The absolute value of the largest element of each column."""
 
     @abc.abstractmethod
-    def apply(self: Rows, linear: Callable[[Array], Array], n: int) -> Rows:
+    def map_rows(self: Rows, linear: Callable[[Array], Array], n: int) -> Rows:
         """A linear function of `n` numbers, applied to each row."""
 
     @property
@@ -198,7 +198,7 @@ class DenseRows(AbstractRows):
     def largest_in_columns(self) -> Float[Array, " n"]:
         return jnp.max(jnp.abs(self.matrix), axis=0)
 
-    def apply(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
+    def map_rows(self, linear: Callable[[Array], Array], n: int) -> "DenseRows":
         del n
         return DenseRows(jax.vmap(linear)(self.matrix))
 
@@ -260,15 +260,15 @@ class RegularisedGram(_DenseGram):
     """The Gram matrix of more rows."""
 
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
-        added = diagonal_shift(self.matrix) if pivot_tolerance is None else pivot_tolerance
+        relative_shift = diagonal_shift(self.matrix) if pivot_tolerance is None else pivot_tolerance
         if len(self.matrix) <= MAX_ELIMINATION:
             matrix = self.matrix.astype(np.promote_types(self.matrix.dtype, np.float32))
-            factors, _ = ldu_factors(matrix, added=added)
+            factors, _ = ldu_factors(matrix, relative_shift=relative_shift)
             return jtu.Partial(ldu_solution, factors, natural_order(len(factors), []))
         # To invert larger factors takes longer than the few substitutions of a step.
         matrix, equilibration = _equilibrated(self.matrix)
         dtype = np.promote_types(matrix.dtype, np.float32)  # LAPACK has no half precision
-        matrix = matrix.astype(dtype) + added * jnp.eye(len(matrix), dtype=dtype)
+        matrix = matrix.astype(dtype) + relative_shift * jnp.eye(len(matrix), dtype=dtype)
         return _Equilibrated(jtu.Partial(lu_solution, lu_factors(matrix)), equilibration, dtype)
 
 

@@ -67,7 +67,7 @@ class SparseRows(AbstractRows):
         dense = self.dense / row_scales[self.pattern.dense_rows, None]
         return SparseRows(self.colours / size, dense, self.pattern)
 
-    def apply(self, linear: Callable[[Array], Array], n: int) -> "SparseRows":
+    def map_rows(self, linear: Callable[[Array], Array], n: int) -> "SparseRows":
         """The function is taken as diagonal. If it is not, the Gram matrix is only approximate, and
         an iteration with it converges more slowly, to the same result."""
         return self.scale_columns(linear(jnp.ones(n, self.dtype)))

@@ -67,7 +67,8 @@ class Newton(AbstractNewton):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         refuse_half_precision("`Newton`", candidate, ", or pass `projection=SimplifiedNewton()`")
         bounds = self.bounds(problem.like)
-        given, start = _Given(problem.dense(), candidate, bounds), (bounds, problem, candidate)
+        given = _Given(problem.with_dense_jacobian(), candidate, bounds)
+        start = bounds, problem, candidate
         # Nobody uses the derivative of the first phase: that of the nearest point is by the second
         # one, and elsewhere it is NaN.
         first_phase = ft.partial(along_gradients, max_steps=self.max_steps, iteration=damped_newton)
@@ -117,7 +118,7 @@ class _Conditions(eqx.Module):
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
         gradient = problem.factor.scaled_gradient(vjp(multiplier / self.row_norms)[0])
-        return jnp.concatenate([problem.factor.to_metric(away) + change - gradient, g])
+        return jnp.concatenate([problem.factor.to_euclidean(away) + change - gradient, g])
 
 
 def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, Array, Problem]:
@@ -127,8 +128,8 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     jacobian = problem.linearise(y)[1]
     row_norms, rows = problem.factor.scaled_rows(jacobian).normalised()
     conditions = _Conditions(given, base, row_norms)
-    sizes_of = [jnp.abs(problem.factor.to_metric(x)) for x in (base, given.candidate)]
-    change = problem.factor.to_metric(base - given.candidate)
+    sizes_of = [jnp.abs(problem.factor.to_euclidean(x)) for x in (base, given.candidate)]
+    change = problem.factor.to_euclidean(base - given.candidate)
     scale = problem.scale(jacobian, y)
 
     def tolerance(default: float, of_user: Any) -> Array:

@@ -68,10 +68,10 @@ def starts_off_manifold(
     scale = problem.scale(jacobian, y)
     limit = jnp.maximum(eps_of(y) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
-    counts = problem.per_residual([entry.value is None for entry in entries])
+    is_checked = problem.per_residual([entry.value is None for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
-    unknown = jnp.isnan(limit) & ~is_constraint
-    return jnp.any(counts & ~unknown & ~(jnp.abs(g) <= limit))
+    is_untestable = jnp.isnan(limit) & ~is_constraint
+    return jnp.any(is_checked & ~is_untestable & ~(jnp.abs(g) <= limit))
 
 
 def failure_cause(

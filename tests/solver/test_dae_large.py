@@ -137,11 +137,15 @@ def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypa
         dae, _, y, structure = made(make, n, least, monkeypatch)
         y = jax.tree.map(lambda x: x + 0.1 * jnp.cos(jnp.arange(x.size) * 1.0).reshape(x.shape), y)
         constraints = dae_module._Constraints(dae)(0.3, y, None)
-        stages = dae_module._Stages(dae)(0.3, y, jax.tree.map(jnp.sin, y), None)
+        stages = dae_module._IndexOneEquations(dae)(0.3, y, jax.tree.map(jnp.sin, y), None)
         return structure, constraints, stages
 
     (dense, *expected), (large, *same) = values(10**9), values(0)
-    assert (large.ranks, large.times, large.brought) == (dense.ranks, dense.times, dense.brought)
+    assert (large.ranks, large.num_differentiations, large.new_unknowns) == (
+        dense.ranks,
+        dense.num_differentiations,
+        dense.new_unknowns,
+    )
     assert large.without_slopes == dense.without_slopes
     for k, (a, b) in enumerate(
         zip(jax.tree.leaves(expected), jax.tree.leaves(same), strict=True)

@@ -101,7 +101,7 @@ class ConservativeLayer(eqx.Module):
         vector = ravel(candidate)
         values = ravel(self.values(*start)).astype(vector.dtype)
         problem = problem_of(self.manifold, values, t, candidate, self.args)
-        return problem.dense(), vector
+        return problem.with_dense_jacobian(), vector
 
 
 def _damped_along(
