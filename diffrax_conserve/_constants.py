@@ -17,40 +17,41 @@ MAX_STEPS = 50
 # method converges quadratically, so a nearby candidate needs fewer. If these are not enough, the
 # plane of the corrections may miss the manifold, as on a circular orbit, where the states with the
 # given energy and angular momentum are a curve and not a surface. From then on the directions are
-# the gradients at each state, or for more than `MAX_ELIMINATION` constraints at some.
+# the gradients at each iterate, or with more than `MAX_ELIMINATION` constraints at every sixth.
 FROZEN_STEPS = 6
 # A correction that does not help is shortened to this share of itself. A half needs twice as many
 # evaluations where it is far too long, and a much smaller share rejects corrections that would have
 # worked.
 BACKTRACKING_FACTOR = 1 / 4
-# Up to this many constraints the matrix is eliminated anew at each state, with pivoting. For more
-# that would take longer than the few steps of an iteration that it saves.
+# Up to this many constraints the Gram matrix `G M⁻¹ Gᵀ` is factored anew at each iterate, with
+# pivoting. For more that would take longer than the few iterations that it saves.
 MAX_PIVOTED = 4
 # This power of roundoff, times the root of the number of constraints, is added to the diagonal of
-# larger matrices, as a share of it, so that they can be factored where constraints depend on each
-# other. The residuals of such constraints contradict each other by roundoff, which becomes an error
-# of all multipliers, in the ratio of roundoff to what is added. With 16 units of roundoff one in
-# five projections on the seven integrals of an orbit, of which five are independent, does not
+# larger Gram matrices, as a share of it, so that they can be factored where constraints depend on
+# each other. The residuals of such constraints contradict each other by roundoff, which becomes an
+# error of all multipliers, in the ratio of roundoff to what is added. With 16 units of roundoff one
+# in five projections on the seven integrals of an orbit, of which five are independent, does not
 # converge.
 REGULARISATION_POWER = 3 / 4
 # The number of steps of iterative refinement, which remove the error that this addition makes.
 NUM_REFINEMENTS = 2
-# In a batch the sums over so many unknowns in a Gram matrix are written out. They take a third of
-# the time of a reduction; the program grows with them.
+# In a batch the sums in a Gram matrix are written out for up to this many unknowns. They take a
+# third of the time of a reduction; the program grows with them.
 MAX_UNROLLED_SUM = 64
 # The derivative of `clip` beyond the bounds; within them it is one. With zero, a
 # constraint whose components are all at bounds would have no gradient, and would never be met.
 SLOPE_BEYOND_BOUNDS = 1e-10
-# Up to this many unknowns and constraints together a dense system is solved in each step: that of
-# the nearest point from far away, and a sparse one that is too wide for blocks.
+# Up to this many unknowns and constraints together a dense system is solved in each step: the
+# equations of the nearest point in `Newton`, and those of sparse constraints that are coupled too
+# widely for blocks, see `_large.sparse`.
 MAX_DENSE_SYSTEM = 512
 # A function is written out in scalars up to this many operations, with which compile time grows.
 # With 512 the Cartesian pendulum, the vortices and the Toda lattice of the catalogue stayed in
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
 # nothing is written out.
 MAX_SCALAR_OPERATIONS = 2048
-# Where most operations are expected to be none, as in a derivative of a derivative, so many times
-# as many are tried. Each takes about 5 µs.
+# Where most operations are expected to simplify away, as in a derivative of a derivative, the
+# attempt is given up only after this many times `MAX_SCALAR_OPERATIONS`. Each takes about 5 µs.
 SIMPLIFICATION_FACTOR = 8
 # The sparsity of a Jacobian is sought from this number of constraints on. With fewer a dense factor
 # is as fast (`benchmarks/cost/many_constraints.py`).

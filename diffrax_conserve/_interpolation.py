@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ._custom_types import DenseInfo, RealScalarLike
-from ._numerics.iterate import any_lane, damped_newton
+from ._numerics.iterate import damped_newton
+from ._numerics.lanes import any_lane
 from ._numerics.problem import Step
 from ._time import FieldTime, nonzero_length
 from ._tree import ravel, tree_stop_gradient, tree_sub, unravel
@@ -100,7 +101,8 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
         t_start, t_end = self.field_time(self.t0), self.field_time(self.t1)
         path = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
-        target, y_start = self.target.unpack().add_rates(t_start, t, path), path(t_start)
+        target = self.target.unpack().with_rates_integrated(t_start, t, path)
+        y_start = path(t_start)
         step = Step(t_start, t_end, y_start, self.error)
         problem = target.problem(t, candidate, step)
         metric, projection = problem.factor, target.projection

@@ -10,7 +10,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .._constants import BACKTRACKING_FACTOR, TOLERANCE_IN_EPS
 from .._large.klu import Places, RealFactor, SparseJacobian
-from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_step, where_active
+from .._numerics.iterate import Solved, iterate, remaining_after_step
+from .._numerics.lanes import any_lane, where_active
 from .._numerics.linear import lu_factors, lu_solution
 from .._numerics.roundoff import cancellation_terms
 from .._numerics.rows import DenseRows

@@ -15,7 +15,8 @@ from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from .._hashable import Hashable
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, iterate, remaining_after_step, where_active
+from .._numerics.iterate import Solved, iterate, remaining_after_step
+from .._numerics.lanes import where_active
 from .._options import check_counts
 from .._projection.options import check_state, option, refuse_half_precision
 from .._solver.terms import in_field_time, vector_fields

@@ -25,7 +25,6 @@ from collections.abc import Callable, Sequence
 from math import prod
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.core
 import jax.custom_batching
@@ -115,65 +114,6 @@ def written_out(
         )
 
     return evaluated
-
-
-def with_lanes_last(run: Callable[[Any, Array, bool], Any], given: Any, y: Array) -> Any:
-    """`run(map_lanes, y, is_batched)`, where `map_lanes(fn)(*xs)` is `fn(given, *xs)`.
-
-    In a batch the lanes are the last axis of `y`, of all `xs`, and of all results, so that an
-    operation on small arrays is a loop over the lanes, which the processor does several at a time.
-    With the lanes first, as `vmap` has them, its innermost loop is over the few elements of one.
-    `map_lanes(fn)` maps a function of one lane over them, in scalars, if that is not too large.
-    """
-    arrays, static = eqx.partition(given, eqx.is_array)
-    leaves, treedef = jtu.tree_flatten(arrays)
-    whole = lambda leaves: eqx.combine(treedef.unflatten(leaves), static)  # noqa: E731
-
-    @jax.custom_batching.custom_vmap
-    @jax.jit
-    def alone(leaves: Any, y: Array) -> Any:
-        return run(lambda fn: ft.partial(fn, whole(leaves)), y, False)
-
-    @ft.partial(jax.jit, static_argnums=0)
-    def lanes(axes: tuple[int | None, ...], leaves: Any, y: Array) -> Any:
-        def map_lanes(fn: Callable[..., Any]) -> Callable[..., Any]:
-            of_leaves = lambda leaves, *xs: fn(whole(leaves), *xs)  # noqa: E731
-            return lambda *xs: _mapped(of_leaves, [*axes], leaves, xs)
-
-        out = run(map_lanes, jnp.moveaxis(y, 0, -1), True)
-        return jtu.tree_map(lambda x: jnp.moveaxis(x, -1, 0), out)
-
-    @alone.def_vmap
-    def batched(size: int, axes: Any, leaves: Any, y: Array) -> Any:
-        of_leaves, of_y = axes
-        y = y if of_y else jnp.broadcast_to(y, (size, *y.shape))
-        out = lanes(tuple(0 if x else None for x in of_leaves), leaves, y)
-        return out, jtu.tree_map(lambda x: True, out)
-
-    return alone(leaves, y)
-
-
-def _mapped(fn: Callable[..., Any], axes: Any, leaves: Any, xs: tuple[Any, ...]) -> Any:
-    """`fn(leaves, *xs)` in each lane, which are the last axis of the `xs` and of the results."""
-    like = [jax.ShapeDtypeStruct(x.shape[:-1], x.dtype) for x in xs]
-    out_like = None
-
-    def in_scalars(leaves: Any, parts: Any) -> Any:
-        nonlocal out_like
-        of_lane = ft.partial(fn, leaves)
-        out_like, evaluate = jax.eval_shape(of_lane, *like), scalarised(of_lane, *like)
-        if evaluate is None:
-            raise _NotWrittenOut
-        return evaluate(*parts)
-
-    parts = [tuple(x.reshape(-1, x.shape[-1])) if x.ndim > 1 else x for x in xs]
-    try:
-        found = jax.vmap(in_scalars, (axes, 0))(leaves, parts)
-    except _NotWrittenOut:
-        return jax.vmap(fn, (axes, *[-1] * len(xs)), -1)(leaves, *xs)
-    return jtu.tree_map(
-        lambda like, x: jnp.stack(x).reshape(*like.shape, -1) if like.ndim else x, out_like, found
-    )
 
 
 def components(x: Array) -> Any:

@@ -26,14 +26,15 @@ from .._hashable import Hashable
 from .._interpolation import AsArrays
 from .._manifold import Constraint, check_manifold, conserved_values, evaluate, named_entries
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_test, where_active
+from .._numerics.iterate import Solved, iterate, remaining_after_test
+from .._numerics.lanes import any_lane, where_active
 from .._numerics.linear import Solve, iterative_refinement
 from .._numerics.metric import Diagonal, broadcast_option
 from .._numerics.problem import Problem, problem_of
 from .._numerics.rows import AbstractGram, AbstractRows, solve_dense
 from .._options import check_counts, check_number
 from .._projection.options import check_state, option
-from .._solver.failure import failure_cause, masked_step, starts_off_manifold
+from .._solver.failure import failure_cause, nan_if_failed, starts_off_manifold
 from .._solver.state import StepFingerprint, initial_values
 from .._solver.terms import in_field_time, is_backsolve, vector_fields
 from .._time import nonzero_length
@@ -246,7 +247,9 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         middle = t0 + (t1 - t0) / 2
         drift = self._drift(terms, middle, v0, args)
         old = state.at, state.slope, state.off
-        changed = state.last_fingerprint.differs(t0, ravel(y0), args, self.constraint) | made_jump
+        last = state.last_fingerprint
+        sums, sizes = last.checksums_of(t0, ravel(y0), args, self.constraint)
+        changed = last.differs(sums, sizes, self.constraint) | made_jump
 
         def anew() -> Any:
             new = self._started(terms, t0, y0, args, state.cancellation)
@@ -282,7 +285,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
         ok = found & keeps
         cause = failure_cause(ok, off, state.cancellation, jnp.concatenate([q1, v1]))
-        (q1, v1), result = masked_step(cause, (q1, v1), dfx.RESULTS.successful)
+        (q1, v1), result = nan_if_failed(cause, (q1, v1), dfx.RESULTS.successful)
         dense_info = dict(y0=y0, step=AsArrays(StepOf(self, given_terms, args, state)))
         multiplier = 2 * displacement * per_step**2
         end = state.last_fingerprint.at(t1, jnp.concatenate([q1, v1]), args, self.constraint)

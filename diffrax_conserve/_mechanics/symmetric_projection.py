@@ -18,7 +18,8 @@ from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScala
 from .._interpolation import AsArrays
 from .._manifold import check_manifold
 from .._numerics.implicit import root
-from .._numerics.iterate import Solved, any_lane, iterate, remaining_after_test, where_active
+from .._numerics.iterate import Solved, iterate, remaining_after_test
+from .._numerics.lanes import any_lane, where_active
 from .._numerics.problem import (
     ABOVE_TOLERANCE,
     AT_ROUNDOFF,
@@ -31,7 +32,7 @@ from .._numerics.rows import AbstractRows, solve_kkt
 from .._projection.base import with_options
 from .._projection.options import check_state
 from .._projection.simplified_newton import SimplifiedNewton
-from .._solver.failure import failure_cause, masked_step, starts_off_manifold
+from .._solver.failure import failure_cause, nan_if_failed, starts_off_manifold
 from .._solver.state import initial_values
 from .._solver.statistics import ProjectionStatistics
 from .._solver.terms import check_root_finder, in_field_time, innermost, refuse_backsolve
@@ -190,7 +191,7 @@ class SymmetricProjection(ForwardingSolver):
         off = starts_off_manifold(start, self.manifold, vector)
         cause = failure_cause(info.ok, off, state.values, y1 - candidate)
         y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
-        y1, result = masked_step(cause, y1, result)
+        y1, result = nan_if_failed(cause, y1, result)
         dense_info = dict(y0=y0, step=AsArrays(StepOf(self, terms, args, state)))
         statistics = state.statistics.add(info, None)
         state = _State(state.inner, state.values, state.cancellation, multiplier, statistics)

@@ -26,8 +26,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-import jax.custom_batching
 import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -42,7 +40,7 @@ from .._constants import (
     SLOPE_BEYOND_BOUNDS,
     TOLERANCE_IN_EPS,
 )
-from .._fast.scalars import with_lanes_last
+from .lanes import any_lane, where_active, with_lanes_last
 from .linear import (
     diagonal_shift,
     gram_matrix,
@@ -139,28 +137,6 @@ def remaining_after_step(converged: Array, hopeful: Array, tests_left: Array) ->
     return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 
 
-@jax.custom_batching.custom_vmap
-def any_lane(flag: Bool[Array, "*lanes"]) -> Bool[Array, ""]:
-    """Whether the flag of any lane of a batch is set, for the conditions of loops and branches.
-
-    If the condition of a `while_loop` differs from lane to lane, `vmap` adds a select for each
-    array in the carry, which keeps the lanes that are done. With this condition, which is the same
-    for all lanes, it adds none. A branch with such a condition remains a branch.
-    """
-    return jnp.any(flag)
-
-
-@any_lane.def_vmap
-def _any_lane(size: int, axes: Any, flags: Bool[Array, "size *lanes"]) -> tuple[Array, bool]:
-    del size, axes
-    return any_lane(jnp.any(flags)), False
-
-
-def where_active(tests_left: Array, moved: Any, y: Any) -> Any:
-    """The moved unknowns where the iteration goes on, and the old ones where it is done."""
-    return jtu.tree_map(lambda a, b: jnp.where(tests_left > 0, a, b), moved, y)
-
-
 # ---- For candidates nearby ----
 
 
@@ -194,13 +170,13 @@ def _newton_of_few_constraints(
     is_batched: bool,
 ) -> Solved:
     """For up to `MAX_ELIMINATION` constraints. In a batch the lanes are the last axis of all
-    arrays; see `with_lanes_last`. The Jacobian stands at one place in the program, which makes it
-    small.
+    arrays, and `map_lanes(fn)(*xs)` is `fn((problem, directions), *xs)` of each lane. The Jacobian
+    stands at one place in the program, which makes it small.
 
-    Up to `MAX_PIVOTED` constraints have a matrix of each state. Pivots that are roundoff count as
-    infinite: if the other constraints hold, these hold too.
+    For up to `MAX_PIVOTED` constraints the matrix `G(y) S Uᵀ` is evaluated at each iterate. Pivots
+    that are roundoff count as infinite: if the other constraints hold, these hold too.
 
-    For more the matrix is that at the candidate, factored once, in the first step. For
+    For more the matrix at the candidate is factored once, in the first step. For
     `FROZEN_STEPS` steps the Jacobian at each state serves for the scales of its residuals alone;
     after them for the directions and the matrix too. Where constraints depend on each other, their
     residuals contradict each other by roundoff, so that in general the default is added to the
@@ -220,8 +196,9 @@ def _newton_of_few_constraints(
         y, *previous = now
         status, residual_to_correct, rows = map_lanes(residual_test)(y)
         is_first, frozen = tests_left > max_steps, tests_left > max_steps + 1 - FROZEN_STEPS
-        # These are by the number before the test, which may set it to two for a step that polishes.
-        # If that step leaves the tolerance, the next one is along the current gradients.
+        # `is_first` and `frozen` follow from the number of tests before this one, which may set it
+        # to two, for a step that polishes. If that leaves the tolerance, the next one is along the
+        # current gradients.
         tests_left = remaining_after_test(status, tests_left)
         refresh = is_first | (~frozen & (tests_left > 0))
 
@@ -231,7 +208,9 @@ def _newton_of_few_constraints(
             if not keeps_matrix:
                 tolerance = _pivot_tolerance(status, rows.dtype)
                 return ldu_factors(matrix, pivot_tolerance=tolerance, pivoting=True)
-            shift = jnp.where(frozen, diagonal_shift(rows), roundoff_pivot_tolerance(rows.dtype))
+            shift = jnp.where(
+                frozen, diagonal_shift(m, rows.dtype), roundoff_pivot_tolerance(rows.dtype)
+            )
             return ldu_factors(matrix, relative_shift=shift)[:1]
 
         def refreshed() -> list[Array]:

@@ -54,9 +54,10 @@ def inverse_factors(matrix: Float[Array, "*batch k k"]) -> tuple[Array, Array]:
     return left / jnp.diagonal(matrix, axis1=-2, axis2=-1)[..., :, None], right
 
 
-def diagonal_shift(matrix: Array) -> float:
-    """What is added by default to the diagonal of a larger Gram matrix with a unit diagonal."""
-    return eps_of(matrix) ** REGULARISATION_POWER * len(matrix) ** 0.5
+def diagonal_shift(m: int, dtype: Any) -> float:
+    """The share that is added by default to the diagonal of a Gram matrix of `m` rows, if these are
+    many."""
+    return eps_of(dtype) ** REGULARISATION_POWER * m**0.5
 
 
 def gram_matrix(
@@ -85,8 +86,8 @@ def ldu_factors(
     pivots `D` on it, and `U⁻¹` above it, if rows and columns are in the order of elimination. The
     second result is the step in which each row was the pivot row, and `m` for the row that is left.
 
-    Each element of the diagonal is multiplied by `1 + relative_shift`, and a pivot of at most its
-    share `pivot_tolerance` counts as infinite, so that its multiplier is zero.
+    Each element `a` of the diagonal becomes `(1 + relative_shift) a`. A pivot of at most
+    `pivot_tolerance a` is replaced by infinity, so that its multiplier is zero.
 
     Divided by the element on the diagonal of the matrix, a pivot is the squared sine of the angle
     between the gradient of a constraint and the span of the gradients before it. If `pivoting`, the
@@ -98,8 +99,9 @@ def ldu_factors(
 
     The inverse factors are not multiplied, as in `inverse_factors`.
 
-    What is done with an element is one loop over the lanes, and the steps of the elimination are a
-    loop too, so that no kernel repeats the steps before it.
+    Every operation is elementwise over the lanes of a batch, which are the last axis. The steps of
+    the elimination are a `fori_loop`: if they were written out, XLA would repeat the earlier ones
+    in the kernel of each later one.
     """
     m, _, *lanes = matrix.shape
     j = natural_order(m, lanes)

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 from .._constants import NOISE_IN_EPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
-from .._manifold import entry_names, evaluate, is_entry
+from .._manifold import at_full_precision, entry_names, evaluate, is_entry
 from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
@@ -53,7 +53,7 @@ class Step(eqx.Module):
     **Attributes:**
 
     - `t0`, `t1`: the ends of the step; in a solve backwards in time `t1 < t0`.
-    - `y0`: the state $y_n$ at `t0`, on the manifold.
+    - `y0`: the state $y_n$ at `t0`. After the first step it is on the manifold.
     - `error`: the error estimate of the wrapped solver at `t1`, or `None` if the solver has none.
     """
 
@@ -235,16 +235,17 @@ class Problem(eqx.Module):
 
 
 def step_norm(
-    start: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
+    changes: Float[Array, " n"], end: Float[Array, " n"], factor: AbstractFactor
 ) -> Float[Array, ""]:
-    """The length of a step in the metric, with which the length of a correction is compared.
+    """The length in the metric of a step to `end` in which the components change by `changes`. The
+    length of a correction is compared with it.
 
     Each component counts as moved by at least `√ε` of itself. Where gradients are nearly parallel,
     the roundoff of the residuals alone moves a state by about that much. Without this floor a step
     at rest would have no length, and every correction would be longer than it.
     """
     floor = eps_of(end) ** 0.5 * jnp.abs(end)
-    return factor.norm(jnp.maximum(jnp.abs(end - start), floor))
+    return factor.norm(jnp.maximum(changes, floor))
 
 
 def relative_to_scale(residual: Any, scale: Any) -> Any:
@@ -268,7 +269,8 @@ def functions_of(manifold: Manifold, t: RealScalarLike, like: Any, args: Args) -
     """The function of each entry, from the numbers of a state to a vector."""
 
     def flat(entry: Any) -> Residual:
-        return lambda y: ravel(evaluate(entry, t, unravel(y, like), args)).astype(y.dtype)
+        fn = lambda y: at_full_precision(entry.fn, t, unravel(y, like), args)  # noqa: E731
+        return lambda y: ravel(fn(y)).astype(y.dtype)
 
     return [flat(entry) for entry in jtu.tree_leaves(manifold, is_leaf=is_entry)]
 

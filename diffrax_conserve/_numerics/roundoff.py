@@ -12,8 +12,8 @@ changes the result by `δ` times the adjoint of that value.
   the operand of a function such as the sine, is one unit of roundoff of its own size.
 - These errors are independent, so that their squares add up.
 - A product only passes relative errors on, so it counts as exact.
-- What does not depend on the state has the same error at each time. It shifts the conserved value,
-  which does no harm, so it counts as exact too.
+- What does not depend on the state counts as exact too. If it depends on `args` alone, its error is
+  the same at each time, and shifts the conserved value, which does no harm.
 - The components of the state themselves are exact here, because their errors are what the gradient
   shows.
 """
@@ -89,8 +89,8 @@ def cancellation_scale(
             for fn, size, one in zip(functions, sizes, few, strict=True)
         ]
         cancellation = jnp.concatenate(measured)
-    shown = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
-    return shown, jacobian, jnp.where(cancellation <= shown, 0, cancellation)
+    gradient_scale = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
+    return gradient_scale, jacobian, jnp.where(cancellation <= gradient_scale, 0, cancellation)
 
 
 def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
@@ -144,56 +144,58 @@ _Pair = tuple[Any, int]  # a value, and how it depends on the state
 
 
 def _with_roundoff(
-    closed: Any, given: list[_Pair], changed: Callable[[Any, Any], Any]
+    closed: Any, given: list[_Pair], with_error: Callable[[Any, Any], Any]
 ) -> list[_Pair]:
-    """The values of a jaxpr in which `changed(x, size)` takes the place of each `x` that has an
+    """The values of a jaxpr in which `with_error(x, size)` takes the place of each `x` that has an
     error of its own, of one unit of roundoff of `size`."""
-    return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, changed))
+    return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, with_error))
 
 
-def _equation(changed: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
+def _equation(with_error: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
     """The values of one equation of a jaxpr, by the rules at the head of this file."""
     name, params = eqn.primitive.name, eqn.params
-    inputs, kind = [x for x, _ in given], max((kind for _, kind in given), default=_CONSTANT)
-    kind = _COMPUTED if kind == _STATE and name not in _PARTS else kind
+    inputs, dependence = [x for x, _ in given], max((each for _, each in given), default=_CONSTANT)
+    dependence = _COMPUTED if dependence == _STATE and name not in _PARTS else dependence
     inner = params.get("call_jaxpr")
     # A function with a derivative rule of its own. We look into it, because a rule is about the
     # derivative and not about the errors, unless JAX could not differentiate what is inside.
     if inner is not None and not _is_opaque(inner.jaxpr):
-        return _with_roundoff(inner, given, changed)
+        return _with_roundoff(inner, given, with_error)
     if name in ("checkpoint", "remat2"):
-        return _with_roundoff(closed_jaxpr(params["jaxpr"]), given, changed)
+        return _with_roundoff(closed_jaxpr(params["jaxpr"]), given, with_error)
     if name == "cond":
-        branches = [ft.partial(_values, changed, branch) for branch in params["branches"]]
-        return [(x, kind) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
+        branches = [ft.partial(_values, with_error, branch) for branch in params["branches"]]
+        return [(x, dependence) for x in jax.lax.switch(inputs[0], branches, *inputs[1:])]
     if name == "scan":
-        return [(x, kind) for x in _scanned(changed, eqn, inputs)]
+        return [(x, dependence) for x in _scanned(with_error, eqn, inputs)]
     products = name in _SUMS_OF_PRODUCTS
-    computed = any(of == _COMPUTED for _, of in given)
-    if ((products and kind) or (name in _SUMS and computed)) and _is_inexact(*inputs):
+    computed = any(each == _COMPUTED for _, each in given)
+    if ((products and dependence) or (name in _SUMS and computed)) and _is_inexact(*inputs):
         # In a sum the parts of the state are exact terms, which the gradient shows.
-        counted = (x if products or of != _STATE else jnp.zeros_like(x) for x, of in given)
+        counted = (x if products or each != _STATE else jnp.zeros_like(x) for x, each in given)
         sizes = [jnp.abs(jax.lax.stop_gradient(x)) for x in counted]
         size = sum(sizes) if name == "sub" else outputs(eqn, *sizes)[0]
-        return [(changed(outputs(eqn, *inputs)[0], size), _COMPUTED)]
-    if name == "convert_element_type" and kind and _is_inexact(*inputs, params["new_dtype"]):
+        return [(with_error(outputs(eqn, *inputs)[0], size), _COMPUTED)]
+    if name == "convert_element_type" and dependence and _is_inexact(*inputs, params["new_dtype"]):
         (x,) = outputs(eqn, *inputs)
-        return [(changed(x, x), _COMPUTED)]
+        return [(with_error(x, x), _COMPUTED)]
     if name in _FUNCTIONS or jaxprs_inside(eqn):
-        inputs = [changed(x, x) if of == _COMPUTED and _is_inexact(x) else x for x, of in given]
-    return [(x, kind) for x in outputs(eqn, *inputs)]
+        inputs = [
+            with_error(x, x) if each == _COMPUTED and _is_inexact(x) else x for x, each in given
+        ]
+    return [(x, dependence) for x in outputs(eqn, *inputs)]
 
 
 def _is_inexact(*xs: Any) -> bool:
     return all(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in xs)
 
 
-def _values(changed: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> list[Any]:
+def _values(with_error: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> list[Any]:
     """As `_with_roundoff`, where all inputs may be computed from the state."""
-    return [x for x, _ in _with_roundoff(closed, [(x, _COMPUTED) for x in inputs], changed)]
+    return [x for x, _ in _with_roundoff(closed, [(x, _COMPUTED) for x in inputs], with_error)]
 
 
-def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
+def _scanned(with_error: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
     params, inside = eqn.params, eqn.params["jaxpr"]
     first, last = carried(eqn)
     num_carry = last - first
@@ -201,7 +203,7 @@ def _scanned(changed: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) ->
     # Without a checkpoint, reverse mode would keep the values of each step of a long scan.
     @jax.checkpoint
     def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
-        outs = _values(changed, inside, *inputs[:first], *carry, *x)
+        outs = _values(with_error, inside, *inputs[:first], *carry, *x)
         return outs[:num_carry], outs[num_carry:]
 
     given = inputs[first:last], inputs[last:]

@@ -7,8 +7,9 @@ Gram matrices are singular where constraints depend on each other, as when an in
 twice. The multipliers are then not unique, but the correction is, if the constraints do not
 contradict each other. There are three ways to solve such a system.
 
-- Up to four constraints: Gaussian elimination with diagonal pivoting, in scalars that are written
-  out (`forward_elimination`), or near the manifold and in `RATTLE` in a loop (`ldu_factors`). The
+- Up to four constraints: Gaussian elimination with diagonal pivoting, written out in scalars in
+  derivatives and for starts far away (`forward_elimination`), and as a loop in the simplified
+  Newton iteration and in `RATTLE` (`ldu_factors`). The
   next constraint is that whose gradient has the largest angle to the span of the gradients before
   it. If the gradient is in this span, its pivot is roundoff, and the multiplier is set to zero: if
   the other constraints hold, this one holds too. Gradients that are only nearly parallel are all
@@ -260,7 +261,11 @@ class RegularisedGram(_DenseGram):
     """The Gram matrix of more rows."""
 
     def factorise(self, *, pivot_tolerance: float | Array | None = None) -> Solve:
-        relative_shift = diagonal_shift(self.matrix) if pivot_tolerance is None else pivot_tolerance
+        relative_shift = (
+            diagonal_shift(len(self.matrix), self.matrix.dtype)
+            if pivot_tolerance is None
+            else pivot_tolerance
+        )
         if len(self.matrix) <= MAX_ELIMINATION:
             matrix = self.matrix.astype(np.promote_types(self.matrix.dtype, np.float32))
             factors, _ = ldu_factors(matrix, relative_shift=relative_shift)

@@ -12,11 +12,10 @@ import numpy as np
 from jax.scipy.sparse.linalg import bicgstab
 from jaxtyping import Array, Float
 
-from .._constants import REGULARISATION_POWER
 from .._large.klu import Places, available
 from .._large.sparse import Pattern, take
 from .._tree import eps_of
-from .linear import Solve, inverse_factors
+from .linear import Solve, diagonal_shift, inverse_factors
 from .rows import AbstractGram, AbstractRows
 
 
@@ -153,10 +152,10 @@ class BlockGram(AbstractGram):
         del pivot_tolerance
         block = self.diagonal.shape[1]
         eye = jnp.eye(block, dtype=bool)
-        added = block**0.5 * eps_of(self.diagonal) ** REGULARISATION_POWER
+        shift = diagonal_shift(block, self.diagonal.dtype)
         # A diagonal element is zero for padding, and for a constraint without a gradient. With a
         # one in its place the multiplier of such a row is its right side.
-        unit = jnp.where(self.diagonal == 0, 1, (1 + added) * self.diagonal)
+        unit = jnp.where(self.diagonal == 0, 1, (1 + shift) * self.diagonal)
         diagonal = jnp.where(eye, unit, self.diagonal)
         if self.factors is None:
             sparse = _reduced(diagonal, self.following, self.preceding)
@@ -169,7 +168,7 @@ class BlockGram(AbstractGram):
         eliminated = jax.vmap(sparse, in_axes=-1, out_axes=-1)(self.columns)
         corner = self.corner - jnp.einsum("dij,ije->de", self.rows, eliminated)
         size = jnp.where(jnp.diagonal(self.corner) > 0, jnp.diagonal(self.corner), 1)
-        halves = inverse_factors((corner + added * jnp.diag(size))[None])
+        halves = inverse_factors((corner + shift * jnp.diag(size))[None])
         return BlockFactors(sparse, (self.rows, eliminated, halves), self.pattern)
 
     def _by_klu(self, diagonal: Array) -> Solve:
@@ -179,7 +178,7 @@ class BlockGram(AbstractGram):
         left, right = self.factors
         values = jnp.sum(take(left.colours, first) * take(right.colours, second), axis=1)
         values = values.at[on_diagonal].set(diagonal.reshape(-1))
-        # With what was added to its diagonal, a symmetric matrix is positive definite, so that no
+        # With what was shift to its diagonal, a symmetric matrix is positive definite, so that no
         # pivot is zero. The test for other matrices takes as long as two solutions.
         if left is not right:
             values = jnp.where(places.is_regular(values), values, jnp.nan)
@@ -255,7 +254,7 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     if diagonal.shape[1] == 1:
         bands = (_before(preceding), diagonal, following)
         return jtu.Partial(lax.linalg.tridiagonal_solve, *(x.reshape(-1) for x in bands))
-    # If the number of blocks is odd, an identity block is added, which is coupled to none.
+    # If the number of blocks is odd, an identity block is shift, which is coupled to none.
     middle, odd = _even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
     to_right, odd_right = _even_and_odd(following)

@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Bool, Float, Inexact
 
 from .._custom_types import Args, RealScalarLike, Values
-from .._numerics.iterate import any_lane
+from .._numerics.lanes import any_lane
 from .._options import calling, check_function
 from .._tree import eps_of
 from .closed_form import ClosedForm

@@ -92,12 +92,12 @@ def _projected(
     y, info = projection.solve(problem(at_candidate), vector)
     # If the projection failed, its result may be NaN, where nothing can be measured.
     usable = unravel(jnp.where(jnp.isfinite(y), y, vector), candidate)
-    shown, _, there = cancellation_scale(manifold, t, usable, args)
+    gradient_scale, _, there = cancellation_scale(manifold, t, usable, args)
     # A projection may have tolerances of its own. If it reports a success, we believe it, unless
     # the scale at the result is less than half of the cancellation at the candidate.
     judged = problem(there)
     ok = tree_stop_gradient(judged).is_on_manifold(lax.stop_gradient(y))
-    ok = ok | info.ok & jnp.all(at_candidate <= 2 * (shown + there))
+    ok = ok | info.ok & jnp.all(at_candidate <= 2 * (gradient_scale + there))
     return unravel(y, candidate), judged.report(vector, y, info.num_iterations, ok=ok)
 
 

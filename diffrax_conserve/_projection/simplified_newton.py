@@ -22,13 +22,13 @@ class SimplifiedNewton(AbstractNewton):
 
     $$\lambda \leftarrow \lambda - (G(y) M^{-1} G^\top)^{-1} g(y).$$
 
-    Two iterations are enough for nearly every step of an integrator. Up to four constraints have
-    the matrix of each state, as it is written here, so this is Newton's method. If they are not met
-    after six iterations, the plane of the corrections may miss the manifold, as on a circular
-    orbit: from then on the corrections are along the gradients at each state. With more than four
-    the matrix is that at the candidate, factored once, as in the simplified Newton iteration, and
-    after six iterations that at each state, or with more than sixteen at each sixth. So after a
-    long step it takes more iterations, and fails sooner. For candidates far away use
+    Two iterations are enough for nearly every step of an integrator. For up to four constraints the
+    matrix is evaluated at each iterate, as it is written here, so this is Newton's method. If they
+    are not met after six iterations, the plane of the corrections may miss the manifold, as on a
+    circular orbit: from then on the corrections are along the gradients at each iterate. For more
+    than four the matrix at the candidate is factored once, as in the simplified Newton iteration,
+    and after six iterations that at each iterate, or for more than sixteen at every sixth. So after
+    a long step it takes more iterations, and fails sooner. For candidates far away use
     [`diffrax_conserve.Newton`][].
 
     The derivative, by the implicit function theorem for $\lambda$, is that of a projection along

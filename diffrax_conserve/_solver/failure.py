@@ -68,10 +68,10 @@ def starts_off_manifold(
     scale = problem.scale(jacobian, y)
     limit = jnp.maximum(eps_of(y) ** 0.5 * scale, problem.tolerance(scale))
     entries = jtu.tree_leaves(manifold, is_leaf=is_entry)
-    is_checked = problem.per_residual([entry.value is None for entry in entries])
+    is_tested = problem.per_residual([entry.value is None for entry in entries])
     is_constraint = problem.per_residual([isinstance(entry, Constraint) for entry in entries])
     is_untestable = jnp.isnan(limit) & ~is_constraint
-    return jnp.any(is_checked & ~is_untestable & ~(jnp.abs(g) <= limit))
+    return jnp.any(is_tested & ~is_untestable & ~(jnp.abs(g) <= limit))
 
 
 def failure_cause(
@@ -86,8 +86,8 @@ def failure_cause(
 
     - `values`: the conserved values, or what else must be known from the start of the solve.
     - `must_be_finite`: the state at its end, or the correction.
-    - `unreachable`: whether a manifold that was not reached is reported as having no state, instead
-      of advising shorter steps.
+    - `unreachable`: whether a failure to reach the manifold is reported as a contradiction of its
+      entries, instead of with the advice to take shorter steps.
     """
     # A sum is finite only if all its terms are. It is one kernel, a test of each component is two.
     finite = jnp.abs(jnp.sum(must_be_finite)) < jnp.inf
@@ -115,7 +115,7 @@ def is_shortest_step(
     return at_rest | (jnp.abs(length) <= TOLERANCE_IN_EPS * eps_of(length) * time)
 
 
-def masked_step(
+def nan_if_failed(
     cause: Int[Array, ""], y: PyTree[Array], result: dfx.RESULTS
 ) -> tuple[Any, dfx.RESULTS]:
     """The state and the result of a step. The state at the end of a step that failed is NaN. In a

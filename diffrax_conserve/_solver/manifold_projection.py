@@ -15,9 +15,9 @@ from .._balance import has_rates
 from .._custom_types import Args, BoolScalarLike, DenseInfo, Manifold, RealScalarLike, Y
 from .._interpolation import AsArrays, MakeManifoldInterpolation
 from .._manifold import Constraint, check_manifold, entry_names, named_entries
-from .._numerics.iterate import any_lane
-from .._numerics.metric import AbstractFactor, Diagonal, Identity
-from .._numerics.problem import Step, step_norm
+from .._numerics.lanes import any_lane
+from .._numerics.metric import Diagonal, Identity
+from .._numerics.problem import Problem, Step, step_norm
 from .._numerics.report import ProjectionInfo
 from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
@@ -29,7 +29,7 @@ from .failure import (
     error_for_controller,
     failure_cause,
     is_shortest_step,
-    masked_step,
+    nan_if_failed,
     starts_off_manifold,
 )
 from .state import State, StepFingerprint, initial_values, updated_units
@@ -88,7 +88,8 @@ class ManifoldProjection(ForwardingSolver):
     into leaves of their own. If the state is one array, each component is a quantity. So the result
     does not depend on the units of the leaves, or of the components of a single array. A quantity
     that never moves, such as a parameter, counts as changing by $\varepsilon$ of itself, so that it
-    is hardly corrected if another can be; one that rests at zero is not corrected at all. For a
+    is hardly corrected if another can be; one that rests at zero is not corrected at all, unless a
+    leaf holds many vectors: there no unit is below $\varepsilon$ times the largest. For a
     field in a single array, all of whose components have one unit, pass
     `projection=SimplifiedNewton(metric=1.0)`, which is the Euclidean metric: a travelling wave with
     all of its integrals kept needs it. Stochastic equations have the Euclidean metric in the
@@ -108,7 +109,8 @@ class ManifoldProjection(ForwardingSolver):
     terms: find a consistent state by [`diffrax_conserve.project`][]. It fails likewise if it
     continues from the `solver_state` of a solve with other values, be it by another state, time,
     `args` or manifold, and after a jump that the step size controller declares, if the constraint
-    jumps too: end the solve there, `project`, and go on. A balance goes on from the state.
+    jumps too: end the solve there, `project`, and go on. A balance does not fail there: it goes on
+    with the value that the state has.
 
     If a projection fails (no convergence, NaN, a correction larger than `max_correction` allows),
     an adaptive solve tries smaller steps until one moves the state by no more than roundoff, or no
@@ -223,20 +225,22 @@ class ManifoldProjection(ForwardingSolver):
         step, candidate, like = wrapped.step, wrapped.candidate, jax.eval_shape(lambda: y0)
         # Dense output stores the target at the start, and adds the integrals up to its own time.
         state, start_target = self._target(terms, state, wrapped, like, args)
-        target = start_target.add_rates(step.t0, step.t1, wrapped.path)
-        y1, info = self.projection.solve(target.problem(step.t1, candidate, step), candidate)
-        metric = start_target.metric(step.t0, step.y0)
-        cause, is_final = self._failure(start_target, state, wrapped, metric, y1, info, made_jump)
-        y1, result = masked_step(cause, y1, wrapped.result)
+        target = start_target.with_rates_integrated(step.t0, step.t1, wrapped.path)
+        problem = target.problem(step.t1, candidate, step)
+        y1, info = self.projection.solve(problem, candidate)
+        cannot_start = self._cannot_start(start_target, state, step, made_jump)
+        times = step.t0, step.t1
+        cause, is_final = self._failure(problem, state, times, candidate, cannot_start, y1, info)
+        y1, result = nan_if_failed(cause, y1, wrapped.result)
         dense_info = dict(
             inner=wrapped.dense_info,
             field_time=wrapped.field_time,
             step_correction=y1 - candidate,
-            step_norm=step_norm(step.y0, y1, metric),
+            step_norm=step_norm(jnp.abs(y1 - step.y0), y1, problem.factor),
             error=step.error if self.projection.sees_step else None,
             target=AsArrays(start_target),
         )
-        error_norm = None if step.error is None else metric.norm(step.error)
+        error_norm = None if step.error is None else problem.factor.norm(step.error)
         state = dataclasses.replace(
             state,
             inner=wrapped.inner,
@@ -332,30 +336,31 @@ class ManifoldProjection(ForwardingSolver):
             displacements=displacements,
         )
         state = dataclasses.replace(state, units=units, displacements=displacements)
-        return state, target.with_balances_met(step.t0, step.y0)
+        if target.rate_integrals is not None:
+            target = target.with_balances_met(step.t0, step.y0)
+        return state, target
 
     def _failure(
         self,
-        target: TargetManifold,
+        problem: Problem,
         state: State,
-        wrapped: "_WrappedStep",
-        metric: AbstractFactor,
+        times: tuple[RealScalarLike, RealScalarLike],
+        candidate: Float[Array, " n"],
+        cannot_start: Bool[Array, ""],
         y1: Float[Array, " n"],
         info: ProjectionInfo,
-        made_jump: BoolScalarLike,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
-        step, candidate = wrapped.step, wrapped.candidate
-        cannot_start = self._cannot_start(target, state, step, made_jump)
-        first_step_size = state.first_step_size.astype(jnp.result_type(step.t1))
-        time = jnp.maximum(jnp.abs(step.t1), first_step_size)
-        step_size = step.t1 - step.t0
-        is_final = cannot_start | is_shortest_step(step_size, time, target.changes, candidate)
+        t0, t1 = times
+        first_step_size = state.first_step_size.astype(jnp.result_type(t1))
+        time, changes = jnp.maximum(jnp.abs(t1), first_step_size), problem.changes
+        assert changes is not None  # in the step of a solve
+        is_final = cannot_start | is_shortest_step(t1 - t0, time, changes, candidate)
         correction, too_far = y1 - candidate, False
         if self.max_correction is not None:
             limit = jnp.asarray(self.max_correction, correction.dtype)
-            limit = limit * step_norm(step.y0, candidate, metric)
-            too_far = metric.norm(correction) > limit
+            limit = limit * step_norm(changes, candidate, problem.factor)
+            too_far = problem.factor.norm(correction) > limit
         is_first_step = jnp.isinf(state.last_fingerprint.checksums[0])
         return failure_cause(
             info.ok,
@@ -370,14 +375,15 @@ class ManifoldProjection(ForwardingSolver):
         self, target: TargetManifold, state: State, step: Step, made_jump: BoolScalarLike
     ) -> Bool[Array, ""]:
         """Whether a conserved value is not finite, or a step starts off the manifold. The second is
-        tested at the start of a solve, also of one that goes on, and after a jump of the vector
-        field, because a constraint may jump with it."""
+        tested in the first step of a solve, unless that continues from a `solver_state` with the
+        same state, time, `args` and manifold, and after a jump of the vector field, because a
+        constraint may jump with it."""
         invalid_values = ~jnp.all(jnp.isfinite(state.values))
         if all(entry.value is not None for _, entry in named_entries(self.manifold)):
             return invalid_values
-        changed = (
-            state.last_fingerprint.differs(step.t0, step.y0, target.args, self.manifold) | made_jump
-        )
+        last = state.last_fingerprint
+        sums, sizes = last.checksums_of(step.t0, step.y0, target.args, self.manifold)
+        changed = last.differs(sums, sizes, self.manifold) | made_jump
         off = lax.cond(
             any_lane(changed),
             lambda: starts_off_manifold(target.problem(step.t0, step.y0), self.manifold, step.y0),
@@ -440,10 +446,10 @@ ManifoldProjection.__init__.__doc__ = r"""**Arguments:**
     `()` if only the bounds of the projection are kept.
 - `projection`: a `SimplifiedNewton`, `Newton`, `AlongLine`, `ClosedForm`, `Staged`, or your own.
 - `max_correction`: a projection fails if its correction is longer than this share of its step, both
-    in the metric of the projection at the start of the step, which is that of motion for
-    projections without a metric, such as `Staged`. A component that hardly moves counts as moving
-    by $\sqrt\varepsilon$ of itself. A limit keeps a state from jumping to another part of the
-    manifold; whether a quantity is conserved at all is told by
+    in the metric of the projection at the candidate. For projections without a metric,
+    such as `Staged`, that is the metric of motion, or with noise the Euclidean one. A component
+    that hardly moves counts as moving by $\sqrt\varepsilon$ of itself. A limit keeps a state from
+    jumping to another part of the manifold; whether a quantity is conserved at all is told by
     [`diffrax_conserve.check_invariance`][]. Default: no limit.
 - `keep_linear`: whether linear functions of the state that the wrapped solver keeps, such as the
     momentum, the mass or the charge, stay conserved although `manifold` does not contain them.

@@ -79,21 +79,20 @@ class StepFingerprint(eqx.Module):
     def at(
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
     ) -> "StepFingerprint":
-        sums, _ = self._checksums(t, y, args, manifold)
+        sums, _ = self.checksums_of(t, y, args, manifold)
         return dataclasses.replace(self, checksums=sums)
 
     def differs(
-        self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
+        self, sums: Float[Array, "3"], sizes: Float[Array, "3"], manifold: Manifold
     ) -> Bool[Array, ""]:
-        """Whether these values are of another state, time, `args` or manifold. XLA may add in
-        another order, so sums are compared up to roundoff. For a state that is NaN the comparison
-        is false, and its projection fails."""
+        """Whether these results of `checksums_of` are those of another state, time, `args` or
+        manifold. XLA may add in another order, so sums are compared up to roundoff. For a state
+        that is NaN the comparison is false, and its projection fails."""
         if self.manifold_hash != hash_of(manifold):
             return jnp.asarray(True)
-        sums, sizes = self._checksums(t, y, args, manifold)
-        return jnp.any(jnp.abs(sums - self.checksums) > TOLERANCE_IN_EPS * eps_of(y) * sizes)
+        return jnp.any(jnp.abs(sums - self.checksums) > TOLERANCE_IN_EPS * eps_of(sums) * sizes)
 
-    def _checksums(
+    def checksums_of(
         self, t: RealScalarLike, y: Float[Array, " n"], args: Args, manifold: Manifold
     ) -> tuple[Float[Array, "3"], Float[Array, "3"]]:
         """Weighted sums of numbers, and the sums of the absolute terms, to which their roundoff is
@@ -149,7 +148,7 @@ def updated_units(
     size = largest_of_quantity(jnp.maximum(jnp.abs(end), change), like)
     change = largest_of_quantity(change, like)
     # Without the constant the derivative of the quotient would divide by a square, which may
-    # underflow, as behind a front that has not arrived.
+    # underflow, as ahead of a front.
     constant = lax.stop_gradient(jnp.where(size > 0, size, 1))
     ratio = (change / constant) / jnp.where(size > 0, size / constant, 1)
     ratio = jnp.maximum(ratio, eps_of(change))
@@ -161,8 +160,9 @@ def with_least_units(units: Float[Array, " n"], like: Any) -> Float[Array, " n"]
     several leaves holds many vectors.
 
     If the last link of a chain at rest is pushed, the others begin to move with high powers of
-    time, by 1e-70 for example. With such a unit the derivative would be wrong: its roundoff, which
-    no number of size one absorbs, would be corrected in whatever has the larger unit.
+    time, by 1e-70 for example. Such a unit is far below the roundoff of the tangents of residuals,
+    which the derivative of a projection would then correct in components with larger units, where
+    it is not small.
     """
     leaves = jtu.tree_leaves(like)
     if len(leaves) == 1 or all(x.ndim < 2 for x in leaves):
@@ -174,10 +174,10 @@ def largest_of_quantity(x: Float[Array, " n"], like: Any) -> Float[Array, " n"]:
     """Each component of `x` replaced by the largest of its quantity, where `x` is the `ravel` of a
     state like `like`.
 
-    Each component of a state is a quantity, with a unit of its own: here, and wherever this package
-    judges errors or drifts. In a state of several leaves each vector along the last axis of a leaf,
-    such as the position of a body, is one quantity, because with different units for its components
-    corrections would turn it. A single array may hold unlike quantities.
+    A single array may hold unlike quantities, so that each of its components is one, as wherever
+    this package judges errors or drifts. In a state of several leaves each vector along the last
+    axis of a leaf, such as the position of a body, is one quantity, because with different units
+    for its components corrections would turn it.
     """
     return _largest(x, like, -1)
 

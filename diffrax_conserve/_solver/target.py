@@ -16,18 +16,19 @@ from .._numerics.problem import Problem, Step, problem_of
 from .._projection.base import AbstractProjection
 from .._tree import ravel, tree_stop_gradient, unravel
 
-# The solution between two times of the vector field, as a vector.
+# The solution in a step, as a function from times of the vector field to vectors.
 Path = Callable[[RealScalarLike], Float[Array, " n"]]
 
 
 class TargetManifold(eqx.Module):
     """Everything that a projection needs except the time, the candidate and the step. Within a step
-    only `rate_integrals` depends on the time, see `add_rates`, so that dense output uses the same
-    target. Times are those of the vector field, and states are vectors.
+    only `rate_integrals` depends on the time, see `with_rates_integrated`, so that dense output has
+    the same target. Times are those of the vector field, and states are vectors.
 
     - `like`: the shapes and dtypes of the state.
     - `values`: the conserved values at the start of the solve.
-    - `cancellation`: the part of the scales of the residuals that no gradient shows.
+    - `cancellation`: the size of the terms that cancel inside the functions, as in `1 - cos(q)`,
+      which is added to the scale of each residual; see `problem`.
     - `changes`: how far each component moves in the step.
     - `factor`: the factor of the metric where the projection has none of its own: of the metric of
       motion, or for a stochastic equation of the Euclidean one.
@@ -49,7 +50,9 @@ class TargetManifold(eqx.Module):
     rate_integrals: Float[Array, "2 m"] | None
     displacements: Float[Array, "k n"] | None
 
-    def add_rates(self, start: RealScalarLike, end: RealScalarLike, path: Path) -> "TargetManifold":
+    def with_rates_integrated(
+        self, start: RealScalarLike, end: RealScalarLike, path: Path
+    ) -> "TargetManifold":
         """The target at a time `end` in a step, given the `path` of the solution from `start`.
 
         The integral over the step is added to the integrals so far by compensated summation (W.
@@ -79,8 +82,7 @@ class TargetManifold(eqx.Module):
         later projections would fail. And a solve that goes on from an event inside of a step has
         the integrals up to the end of that step. In both cases a balance goes on from the state.
         """
-        if self.rate_integrals is None:
-            return self
+        assert self.rate_integrals is not None
         problem, y = tree_stop_gradient((self.problem(t, y), y))
         residual, jacobian = problem.linearise(y)
         half_noise = (
@@ -102,7 +104,9 @@ class TargetManifold(eqx.Module):
             values = values + self.rate_integrals[0]
             decrease = jnp.maximum(jnp.abs(self.values) - jnp.abs(values), 0)
             cancellation = cancellation + decrease
-        factor = self.metric(t, y)
+        metric, factor = self.projection.metric, self.factor
+        if metric is not None:
+            factor = factor_of(metric, t, unravel(y, self.like), self.args)
         if self.displacements is not None:
             factor = PreferredSubspace.spanned_by(factor, self.displacements)
         return problem_of(
@@ -118,8 +122,3 @@ class TargetManifold(eqx.Module):
             rtol=self.projection.rtol,
             atol=self.projection.atol,
         )
-
-    def metric(self, t: RealScalarLike, y: Float[Array, " n"]) -> AbstractFactor:
-        """The factor of the metric of the projection at a state, without a preferred subspace."""
-        own = self.projection.metric
-        return self.factor if own is None else factor_of(own, t, unravel(y, self.like), self.args)

@@ -22,8 +22,8 @@ def time_direction(terms: PyTree[dfx.AbstractTerm], t: RealScalarLike) -> Real[A
 
 
 def in_field_time(terms: PyTree[dfx.AbstractTerm], *times: RealScalarLike) -> tuple[Any, ...]:
-    """The terms and times in the time of the vector field, without the sign of diffrax. They are
-    for evaluating the vector field; a wrapped solver takes those that diffrax gives."""
+    """The terms and times in the time of the vector field. `diffeqsolve` negates both if `t1 < t0`,
+    which is undone here for evaluating the vector field; a wrapped solver takes what it gives."""
     field_time = FieldTime(time_direction(terms, times[0]))
     is_term = lambda x: isinstance(x, dfx.AbstractTerm)  # noqa: E731
     bare = lambda x: x.term if isinstance(x, WrapTerm) else x  # noqa: E731

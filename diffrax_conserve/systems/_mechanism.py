@@ -16,7 +16,8 @@ from .._constants import MAX_STEPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, RealScalarLike
 from .._manifold import FirstIntegral
 from .._numerics.implicit import root
-from .._numerics.iterate import iterate, remaining_after_test, where_active
+from .._numerics.iterate import iterate, remaining_after_test
+from .._numerics.lanes import where_active
 from .._numerics.problem import ABOVE_TOLERANCE, AT_ROUNDOFF
 from .._numerics.rows import solve_dense
 from .._projection.closed_form import ClosedForm

@@ -96,7 +96,9 @@ def test_the_inverse_of_many_lanes_is_that_of_each(n):
 
     def solve(rows, b):
         rows = jnp.moveaxis(rows, 0, -1)
-        factors = ldu_factors(gram_matrix(rows, rows), relative_shift=diagonal_shift(rows))
+        factors = ldu_factors(
+            gram_matrix(rows, rows), relative_shift=diagonal_shift(len(rows), rows.dtype)
+        )
         return ldu_solution(*factors, jnp.broadcast_to(b[:, None], (7, 4)))
 
     found = np.asarray(jax.jit(solve)(rows, consistent)).T

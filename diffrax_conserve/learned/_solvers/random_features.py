@@ -20,7 +20,8 @@ from jaxtyping import Array, Bool, Float
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._numerics.implicit import root
-from ..._numerics.iterate import Solved, iterate, remaining_after_step, where_active
+from ..._numerics.iterate import Solved, iterate, remaining_after_step
+from ..._numerics.lanes import where_active
 from ..._projection.options import check_state, refuse_half_precision
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import is_ode
