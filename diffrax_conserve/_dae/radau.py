@@ -230,8 +230,10 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         increments = y - start
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
         ok = found.ok & jnp.all(jnp.isfinite(error))
-        big = float(jnp.finfo(start.dtype).max) ** 0.5
-        error = lax.stop_gradient(jnp.where(ok, error, big))
+        # The shortest step reports no error, so that it is accepted, and its result ends the solve.
+        shortest = jnp.abs(t1 - t0) <= TOLERANCE_IN_EPS * eps_of(t1) * jnp.abs(t1)
+        big = jnp.where(shortest, 0, float(jnp.finfo(start.dtype).max) ** 0.5)
+        error = lax.stop_gradient(jnp.where(ok, error, big.astype(start.dtype)))
         success, failure = dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
         result = dfx.RESULTS.where(found.ok, success, failure)  # pyright: ignore
         y1 = unravel(y[2], y0)

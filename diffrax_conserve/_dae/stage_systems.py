@@ -32,12 +32,29 @@ Solve = Callable[..., Array]
 Freed = Callable[..., tuple[Array, ...]]
 
 
+def _stages_solution(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Float[Array, " N"]:
+    """The solution of a linear system with the matrix of the three stages.
+
+    The unit of an unknown without slopes, such as a force, may have any ratio to those of the
+    others, and must not decide what is lost by rounding. So, as in `Structure.equilibrated_units`,
+    each row is divided by its largest element of an unknown with slopes, and then each column by
+    its largest element. The blocks off the diagonal are `∂F/∂y'` alone, up to a factor.
+    """
+    n = len(b) // 3
+    has_slopes = jnp.tile(jnp.any(matrix[:n, n : 2 * n] != 0, axis=0), 3)
+    sizes = lax.stop_gradient(jnp.abs(matrix))
+    rows = jnp.max(jnp.where(has_slopes, sizes, 0), axis=1)
+    rows = jnp.where(rows > 0, rows, jnp.max(sizes, axis=1))
+    columns = jnp.max(sizes / rows[:, None], axis=0)
+    return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
+
+
 class DenseSystems(NamedTuple):
     by_y: Float[Array, "n n"]
     by_slope: Float[Array, "n n"]
 
     # How a linear system with the matrix of the stages is solved, and how the matrix is computed.
-    stages_solution = staticmethod(jnp.linalg.solve)
+    stages_solution = staticmethod(_stages_solution)
     stages_jacobian = staticmethod(jax.jacfwd)
 
     @classmethod

@@ -193,7 +193,7 @@ class SymmetricProjection(ForwardingSolver):
         y1 = jnp.where(result == dfx.RESULTS.successful, y1, jnp.nan)
         y1, result = nan_if_failed(cause, y1, result)
         dense_info = dict(y0=y0, step=AsArrays(StepOf(self, terms, args, state)))
-        statistics = state.statistics.add(info, None)
+        statistics = state.statistics.add(info, jnp.nan)
         state = _State(state.inner, state.values, state.cancellation, multiplier, statistics)
         return unravel(y1, y0), None, dense_info, state, result
 

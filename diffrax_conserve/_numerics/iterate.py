@@ -123,9 +123,7 @@ def remaining_after_test(status: Array, tests_left: Array, *, polish: bool = Tru
     """
     then = jnp.where(status == NOT_FINITE, jnp.minimum(tests_left - 1, 1), tests_left - 1)
     then = jnp.where((status < WITHIN_TOLERANCE) & (then == 0), -1, then)
-    then = jnp.where(
-        status == WITHIN_TOLERANCE, jnp.where(tests_left > 2, 2, 0) if polish else 0, then
-    )
+    then = jnp.where(status == WITHIN_TOLERANCE, jnp.where(tests_left > 2, 2 * polish, 0), then)
     then = jnp.where(status == AT_ROUNDOFF, 0, then)
     return jnp.where(tests_left > 0, then, tests_left).astype(tests_left.dtype)
 

@@ -178,7 +178,7 @@ class BlockGram(AbstractGram):
         left, right = self.factors
         values = jnp.sum(take(left.colours, first) * take(right.colours, second), axis=1)
         values = values.at[on_diagonal].set(diagonal.reshape(-1))
-        # With what was shift to its diagonal, a symmetric matrix is positive definite, so that no
+        # With what was added to its diagonal, a symmetric matrix is positive definite, so that no
         # pivot is zero. The test for other matrices takes as long as two solutions.
         if left is not right:
             values = jnp.where(places.is_regular(values), values, jnp.nan)
@@ -254,7 +254,7 @@ def _reduced(diagonal: Array, following: Array | None, preceding: Array | None) 
     if diagonal.shape[1] == 1:
         bands = (_before(preceding), diagonal, following)
         return jtu.Partial(lax.linalg.tridiagonal_solve, *(x.reshape(-1) for x in bands))
-    # If the number of blocks is odd, an identity block is shift, which is coupled to none.
+    # If the number of blocks is odd, an identity block is added, which is coupled to none.
     middle, odd = _even_and_odd(diagonal, jnp.eye(diagonal.shape[1]))
     # The odd block `2 i + 1` is between the even blocks `2 i` and `2 i + 2`.
     to_right, odd_right = _even_and_odd(following)

@@ -88,11 +88,11 @@ class ManifoldProjection(ForwardingSolver):
     into leaves of their own. If the state is one array, each component is a quantity. So the result
     does not depend on the units of the leaves, or of the components of a single array. A quantity
     that never moves, such as a parameter, counts as changing by $\varepsilon$ of itself, so that it
-    is hardly corrected if another can be; one that rests at zero is not corrected at all, unless a
-    leaf holds many vectors: there no unit is below $\varepsilon$ times the largest. For a
-    field in a single array, all of whose components have one unit, pass
-    `projection=SimplifiedNewton(metric=1.0)`, which is the Euclidean metric: a travelling wave with
-    all of its integrals kept needs it. Stochastic equations have the Euclidean metric in the
+    is hardly corrected if another can be; one that rests at zero is not corrected at all, but in a
+    leaf of many vectors no $s$ is below $\varepsilon$ times the largest. For a field in a single
+    array, all of whose components have one unit, pass `projection=SimplifiedNewton(metric=1.0)`,
+    which is the Euclidean metric: a travelling wave with all of its integrals kept needs it.
+    Stochastic equations have the Euclidean metric in the
     numbers of the state, because there the metric decides which equation is solved: for mixed units
     pass `projection=SimplifiedNewton(metric=(1 / metres**2, 1 / speed**2))`.
 
@@ -240,7 +240,7 @@ class ManifoldProjection(ForwardingSolver):
             error=step.error if self.projection.sees_step else None,
             target=AsArrays(start_target),
         )
-        error_norm = None if step.error is None else problem.factor.norm(step.error)
+        error_norm = jnp.nan if step.error is None else problem.factor.norm(step.error)
         state = dataclasses.replace(
             state,
             inner=wrapped.inner,

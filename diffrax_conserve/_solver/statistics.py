@@ -81,9 +81,9 @@ class ProjectionStatistics(eqx.Module):
             )
         return text
 
-    def add(self, info: ProjectionInfo, error: Array | None) -> "ProjectionStatistics":
+    def add(self, info: ProjectionInfo, error: Array | float) -> "ProjectionStatistics":
         """The statistics after one more step, with the report on its projection, and the length of
-        the error estimate."""
+        the error estimate, NaN if there is none."""
         counts = (
             self.num_projections + 1,
             self.num_iterations + info.num_iterations,
@@ -95,7 +95,7 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.residual_after, info.residual_after),
             jnp.maximum(self.correction, info.correction),
             jnp.maximum(self.roundoff, info.roundoff),
-            self.error if error is None else jnp.fmax(self.error, error),
+            jnp.fmax(self.error, error),
         )
         return ProjectionStatistics(jnp.stack(counts), jnp.stack(sizes), self.names, self.bounded)
 

@@ -333,3 +333,53 @@ def test_the_derivative_of_forces_does_not_depend_on_their_sizes(k):
     exact = np.linalg.solve(differences @ differences.T, differences @ push)
     np.testing.assert_allclose(tangent[k + 1 :], exact, rtol=0, atol=1e-9 * np.max(abs(exact)))
     np.testing.assert_allclose(tangent[: k + 1], 0, atol=1e-9)
+
+
+def test_the_derivative_in_single_precision_does_not_depend_on_the_unit_of_a_force():
+    """A pendulum of index 3: the mass is a factor of the force, and of nothing else. Compared with
+    an ordinary differential equation for the angle."""
+
+    def residual(t, y, slope, args):
+        (q, v, force), (dq, dv, _), (mass, gravity) = y, slope, args
+        down = jnp.array([0, 1], q.dtype)
+        return dq - v, mass * dv + force * q + mass * gravity * down, jnp.sum(q**2) - 1
+
+    dae = dfc.DAE(residual=residual)
+    guess = tuple(np.array(x, np.float32) for x in ([0.6, -0.8], [0.8, 0.6], 0))
+
+    def end(gravity, mass):
+        y0 = dae.consistent(guess, args=(mass, gravity))
+        steps = dfx.PIDController(rtol=1e-5, atol=1e-5)
+        t0, t1, dt0 = np.float32([0, 2, 0.01])
+        found = dfx.diffeqsolve(
+            *(dae.term, dae.wrap(dfc.Radau()), t0, t1, dt0, y0, (mass, gravity)),
+            **dict(stepsize_controller=steps, adjoint=dfx.ForwardMode(), max_steps=200),
+        )
+        q, v, force = (x[-1] for x in found.ys)
+        return jnp.concatenate([q, v, force[None] / mass])
+
+    def by_angle(gravity):
+        field = lambda t, y, args: jnp.stack([y[1], -gravity * jnp.sin(y[0])])  # noqa: E731
+        y0 = jnp.array([np.arctan2(0.6, 0.8), 1.0])
+        options = dict(stepsize_controller=PRECISE, adjoint=dfx.ForwardMode(), max_steps=4096)
+        found = dfx.diffeqsolve(dfx.ODETerm(field), dfx.Tsit5(), 0, 2, 0.01, y0, **options)
+        angle, speed = found.ys[-1]
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        return jnp.stack([sine, -cosine, cosine * speed, sine * speed, speed**2 + gravity * cosine])
+
+    one, masses = jnp.float32(1), jnp.array([1e-12, 1e-8, 1e-4, 1, 1e4], jnp.float32)
+    tangent = lambda mass: jax.jvp(lambda g: end(g, mass), (9.81 * one,), (one,))[1]  # noqa: E731
+    expected = jax.jvp(by_angle, (9.81,), (1.0,))[1]
+    for found in jax.jit(jax.vmap(tangent))(masses):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4 * largest(expected))
+
+
+def test_a_solve_that_meets_a_fold_ends_there():
+    """`x = 1 - z²` with `x' = 1` has no solution after `t = 1`."""
+    dae = pair(lambda t, x, z, args: jnp.ones_like(x), lambda t, x, z, args: 1 - z**2 - x)
+    steps = dfx.PIDController(rtol=1e-4, atol=1e-4)
+    y0 = dae.consistent(jnp.zeros(1), jnp.ones(1))
+    options = dict(stepsize_controller=steps, max_steps=1000, throw=False)
+    found = dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, 2.0, 0.01, y0, **options)
+    assert found.result == dfx.RESULTS.nonlinear_divergence
+    assert found.stats["num_steps"] < 250
