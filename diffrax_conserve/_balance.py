@@ -55,15 +55,15 @@ def integrated_rates(
     manifold: Manifold,
     start: RealScalarLike,
     end: RealScalarLike,
-    path: Callable[[RealScalarLike], Y],
+    interpolant: Callable[[RealScalarLike], Y],
     args: Args,
 ) -> Values:
-    """The integral of each rate along `path`, zero for an entry without one."""
+    """The integral of each rate along the `interpolant`, zero for an entry without a rate."""
     half = (end - start) / 2  # the nodes are in the interval from -1 to 1
 
     def at(node: RealScalarLike) -> Values:
         t = start + (1 + node) * half
-        return rates(manifold, t, path(t), args)
+        return rates(manifold, t, interpolant(t), args)
 
     def total(x: Array) -> Array:
         return jnp.sum(jax.vmap(jnp.multiply)(weights.astype(x.dtype), x), axis=0)

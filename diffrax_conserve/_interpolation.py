@@ -100,9 +100,9 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
     def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The projection of the moved interpolant, or that itself where no projection succeeds."""
         t_start, t_end = self.field_time(self.t0), self.field_time(self.t1)
-        path = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
-        target = self.target.unpack().with_rates_integrated(t_start, t, path)
-        y_start = path(t_start)
+        interpolant = lambda t: ravel(self.inner.evaluate(self.field_time(t)))  # noqa: E731
+        target = self.target.unpack().with_rates_integrated(t_start, t, interpolant)
+        y_start = interpolant(t_start)
         step = Step(t_start, t_end, y_start, self.error)
         problem = target.problem(t, candidate, step)
         metric, projection = problem.factor, target.projection
@@ -141,5 +141,5 @@ class MakeManifoldInterpolation:
     def __call__(
         self, *, t0: RealScalarLike, t1: RealScalarLike, inner: DenseInfo, **fields: Any
     ) -> ManifoldInterpolation:
-        path = self.inner_cls(t0=t0, t1=t1, **inner)
-        return ManifoldInterpolation(t0=t0, t1=t1, inner=path, **fields)
+        interpolation = self.inner_cls(t0=t0, t1=t1, **inner)
+        return ManifoldInterpolation(t0=t0, t1=t1, inner=interpolation, **fields)

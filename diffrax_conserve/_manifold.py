@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 
 from ._custom_types import Args, ConstraintFn, Manifold, RealScalarLike, Values, Y
 from ._hashable import Hashable
-from ._options import calling, check_function, check_numbers, dtype_of, is_real
+from ._options import check_function, check_numbers, dtype_of, is_real, noting_call
 from ._tree import tree_shapes, tree_size
 
 
@@ -139,7 +139,7 @@ class LieDerivative(eqx.Module):
 
 def slope_of(vector_field: Any, t: RealScalarLike, y: Y, args: Args) -> Y:
     """The value of a vector field, like the state; an error tells how the field was called."""
-    with calling("`vector_field`", "vector_field(t, y, args)", t, y, args):
+    with noting_call("`vector_field`", "vector_field(t, y, args)", t, y, args):
         return slope_like(y, vector_field(t, y, args))
 
 
@@ -215,8 +215,8 @@ def at_full_precision(fn: ConstraintFn, t: RealScalarLike, y: Y, args: Args) -> 
         return fn(t, y, args)
 
 
-def calling_fn(name: str, t: RealScalarLike, y: Y, args: Args) -> AbstractContextManager[None]:
-    return calling(f"`fn` of `{name}`", "fn(t, y, args)", t, y, args)
+def noting_call_of(name: str, t: RealScalarLike, y: Y, args: Args) -> AbstractContextManager[None]:
+    return noting_call(f"`fn` of `{name}`", "fn(t, y, args)", t, y, args)
 
 
 def conserved_values(
@@ -246,7 +246,7 @@ def conserved_values(
             ) from error
     found = []
     for (name, entry), value in zip(entries, values, strict=True):
-        with calling_fn(name, t, y, args):
+        with noting_call_of(name, t, y, args):
             output = at_full_precision(entry.fn, t, y, args)
         _check_output(name, entry, output, t, y, args)
         if isinstance(entry, Constraint):
@@ -278,7 +278,7 @@ def _check_output(
                 "or split a complex value into its real and its imaginary part."
             )
     if entry.rate is not None:
-        with calling(f"`rate` of `{name}`", "rate(t, y, args)", t, y, args):
+        with noting_call(f"`rate` of `{name}`", "rate(t, y, args)", t, y, args):
             rates = eqx.filter_eval_shape(entry.rate, t, y, args)
         _check_shapes(f"`rate` of `{name}` returns", rates, output)
         if not all(map(is_real, jtu.tree_leaves(rates))):

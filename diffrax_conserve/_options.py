@@ -100,8 +100,8 @@ def parameters(call: str) -> list[str]:
 
 
 @contextlib.contextmanager
-def calling(name: str, call: str, *given: Any) -> Iterator[None]:
-    """Tells with an error of a function of the user which one it is, and what it was given."""
+def noting_call(name: str, call: str, *given: Any) -> Iterator[None]:
+    """Adds to an error inside of a function of the user its name, and what it was given."""
     try:
         yield
     except Exception as error:
@@ -117,7 +117,7 @@ def calling(name: str, call: str, *given: Any) -> Iterator[None]:
 @contextlib.contextmanager
 def one_of(states: Any, args: Any = ()) -> Iterator[None]:
     """Tells with an error of a function what it was called with: one of `states`, and `args`, if no
-    `calling` inside tells that."""
+    `noting_call` inside tells that."""
     try:
         yield
     except Exception as error:

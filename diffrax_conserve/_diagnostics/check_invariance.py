@@ -20,13 +20,13 @@ from .._manifold import (
     Constraint,
     FirstIntegral,
     LieDerivative,
-    calling_fn,
     check_manifold,
     check_vector_field,
     conserved_values,
     evaluate,
     is_entry,
     named_entries,
+    noting_call_of,
     slope_of,
 )
 from .._numerics.problem import problem_of, relative_to_scale
@@ -237,7 +237,7 @@ def _relative_sizes(
     t = t.astype(dtype)
     values = ravel(conserved_values(entry, t, y, args, root=name)).astype(dtype)
     problem = problem_of(entry, values, t, y, args)
-    with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
+    with noting_call_of(name, t, y, args):  # JAX refuses to differentiate some loops
         residual, jacobian = problem.linearise(vector)
     in_time = lambda t: ravel(evaluate(entry, t, y, args)).astype(dtype)  # noqa: E731
     _, partial = jax.jvp(in_time, (t,), (jnp.ones_like(t),))

@@ -20,7 +20,7 @@ from jaxtyping import ArrayLike, PyTree
 
 from .._custom_types import Args, Manifold, RealScalarLike
 from .._manifold import check_manifold, check_vector_field, slope_of
-from .._options import ONE_STATE, calling, check_counts, check_float64, check_number, dtype_of
+from .._options import ONE_STATE, check_counts, check_float64, check_number, dtype_of, noting_call
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
 from .check_invariance import entries_of
@@ -154,7 +154,7 @@ def compare(
     first = jtu.tree_map(lambda x: x[0], y0s)
     dtype = jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0s))).dtype
     start = jnp.asarray(t0, dtype)
-    with calling("`vector_field`", "vector_field(t, y, args)", t0, first, args):
+    with noting_call("`vector_field`", "vector_field(t, y, args)", t0, first, args):
         eqx.filter_eval_shape(lambda y: slope_of(vector_field, start, y, args), first)
     entries = dict(entries_of(manifold))
     dense = any(getattr(entry, "rate", None) is not None for entry in entries.values())

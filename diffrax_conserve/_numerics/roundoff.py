@@ -30,7 +30,7 @@ from .._constants import MIN_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
 from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, outputs, walk
 from .._large.sparse import pattern_of
-from .._manifold import calling_fn, named_entries
+from .._manifold import named_entries, noting_call_of
 from .._tree import eps_of, ravel, tree_stop_gradient
 from .problem import functions_of
 from .rows import AbstractRows, DenseRows
@@ -69,13 +69,13 @@ def cancellation_scale(
     functions = functions_of(manifold, t, y, args)
     entries, sizes = [*zip(named_entries(manifold), functions, strict=True)], []
     for (name, _), fn in entries:
-        with calling_fn(name, t, y, args):
+        with noting_call_of(name, t, y, args):
             sizes.append(jax.eval_shape(fn, vector).size)
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
         measured = []
         for (name, _), fn in entries:
-            with calling_fn(name, t, y, args):  # JAX refuses to differentiate some loops
+            with noting_call_of(name, t, y, args):  # JAX refuses to differentiate some loops
                 measured.append(cancellation_terms(fn, vector))
         value, matrix, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
         jacobian = DenseRows(matrix)

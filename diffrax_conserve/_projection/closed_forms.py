@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Inexact
 
 from .._custom_types import Args, RealScalarLike, Values
 from .._numerics.lanes import any_lane
-from .._options import calling, check_function
+from .._options import check_function, noting_call
 from .._tree import eps_of
 from .closed_form import ClosedForm
 
@@ -147,7 +147,7 @@ class _OfPart(eqx.Module):
     def __call__(self, t: RealScalarLike, y: Any, args: Args, values: Values) -> Any:
         del t, args, values
         part = lambda y: tuple(jtu.tree_leaves(self.where(y)))  # noqa: E731
-        with calling("`where`", "where(y)", y):
+        with noting_call("`where`", "where(y)", y):
             part(y)
         return eqx.tree_at(part, y, tuple(map(self.formula, part(y))))
 

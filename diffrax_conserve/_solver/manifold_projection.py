@@ -34,7 +34,7 @@ from .failure import (
 )
 from .state import State, StepFingerprint, initial_values, updated_units
 from .statistics import ProjectionStatistics
-from .target import Path, TargetManifold
+from .target import Interpolant, TargetManifold
 from .terms import (
     check_direction,
     check_projects_nothing,
@@ -225,12 +225,18 @@ class ManifoldProjection(ForwardingSolver):
         step, candidate, like = wrapped.step, wrapped.candidate, jax.eval_shape(lambda: y0)
         # Dense output stores the target at the start, and adds the integrals up to its own time.
         state, start_target = self._target(terms, state, wrapped, like, args)
-        target = start_target.with_rates_integrated(step.t0, step.t1, wrapped.path)
+        target = start_target.with_rates_integrated(step.t0, step.t1, wrapped.interpolant)
         problem = target.problem(step.t1, candidate, step)
         y1, info = self.projection.solve(problem, candidate)
-        cannot_start = self._cannot_start(start_target, state, step, made_jump)
-        times = step.t0, step.t1
-        cause, is_final = self._failure(problem, state, times, candidate, cannot_start, y1, info)
+        cause, is_final = self._failure(
+            problem,
+            state,
+            step.t0,
+            candidate,
+            self._cannot_start(start_target, state, step, made_jump),
+            y1,
+            info,
+        )
         y1, result = nan_if_failed(cause, y1, wrapped.result)
         dense_info = dict(
             inner=wrapped.dense_info,
@@ -240,13 +246,14 @@ class ManifoldProjection(ForwardingSolver):
             error=step.error if self.projection.sees_step else None,
             target=AsArrays(start_target),
         )
-        error_norm = jnp.nan if step.error is None else problem.factor.norm(step.error)
         state = dataclasses.replace(
             state,
             inner=wrapped.inner,
             rate_integrals=target.rate_integrals,
             last_fingerprint=state.last_fingerprint.at(step.t1, y1, args, self.manifold),
-            statistics=state.statistics.add(info, error_norm),
+            statistics=state.statistics.add(
+                info, jnp.nan if step.error is None else problem.factor.norm(step.error)
+            ),
         )
         error = error_for_controller(cause, is_final, wrapped.error)
         return unravel(y1, like), error, dense_info, state, result
@@ -272,8 +279,10 @@ class ManifoldProjection(ForwardingSolver):
         step = Step(field_time(t0), field_time(t1), ravel(y0), error_vector)
         # The dense output of the step is rarely needed, so it is made when it is called.
         interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
-        path = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
-        return _WrappedStep(step, ravel(y1), path, error, dense_info, inner, result, field_time)
+        interpolant = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
+        return _WrappedStep(
+            step, ravel(y1), interpolant, error, dense_info, inner, result, field_time
+        )
 
     @property
     def _forwards_made_jump(self) -> bool:
@@ -321,7 +330,7 @@ class ManifoldProjection(ForwardingSolver):
         changes = jnp.abs(candidate - step.y0)
         units = updated_units(state.units, changes, candidate, like)
         if displacements is not None:
-            new = displacements_along(wrapped.path, step)
+            new = displacements_along(wrapped.interpolant, step)
             displacements = jnp.concatenate([new, displacements[:_NUM_DISPLACEMENTS]])
         target = TargetManifold(
             self.projection,
@@ -344,17 +353,16 @@ class ManifoldProjection(ForwardingSolver):
         self,
         problem: Problem,
         state: State,
-        times: tuple[RealScalarLike, RealScalarLike],
+        t0: RealScalarLike,
         candidate: Float[Array, " n"],
         cannot_start: Bool[Array, ""],
         y1: Float[Array, " n"],
         info: ProjectionInfo,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
-        t0, t1 = times
-        first_step_size = state.first_step_size.astype(jnp.result_type(t1))
-        time, changes = jnp.maximum(jnp.abs(t1), first_step_size), problem.changes
+        t1, changes = problem.t, problem.changes
         assert changes is not None  # in the step of a solve
+        time = jnp.maximum(jnp.abs(t1), state.first_step_size.astype(jnp.result_type(t1)))
         is_final = cannot_start | is_shortest_step(t1 - t0, time, changes, candidate)
         correction, too_far = y1 - candidate, False
         if self.max_correction is not None:
@@ -414,7 +422,7 @@ class _WrappedStep(NamedTuple):
 
     - `step`: the step, as a projection sees it.
     - `candidate`: the state at its end.
-    - `path`: its dense output, as a function from times to states.
+    - `interpolant`: its dense output, as a function from times to states.
     - `error`, `dense_info`, `inner`, `result`: the error estimate, dense output, solver state and
       result, as the wrapped solver returns them.
     - `field_time`: the time of the vector field as a function of that of the solver, and back.
@@ -422,7 +430,7 @@ class _WrappedStep(NamedTuple):
 
     step: Step
     candidate: Float[Array, " n"]
-    path: Path
+    interpolant: Interpolant
     error: Y | None
     dense_info: DenseInfo
     inner: Any
@@ -430,13 +438,13 @@ class _WrappedStep(NamedTuple):
     field_time: FieldTime
 
 
-def displacements_along(path: Path, step: Step) -> Float[Array, "k n"]:
+def displacements_along(interpolant: Interpolant, step: Step) -> Float[Array, "k n"]:
     """The changes of the state from the start of a step, in the dense output of the wrapped solver,
     after equal parts of the step. Of a Runge-Kutta method they are combinations of its slopes, so
     that they are orthogonal to each `c` with `c · f = 0`."""
     shares = (k / _NUM_DISPLACEMENTS for k in range(1, _NUM_DISPLACEMENTS + 1))
     times = (step.t0 + share * (step.t1 - step.t0) for share in shares)
-    return jnp.stack([path(t) - step.y0 for t in times])
+    return jnp.stack([interpolant(t) - step.y0 for t in times])
 
 
 ManifoldProjection.__init__.__doc__ = r"""**Arguments:**

@@ -17,7 +17,7 @@ from .._projection.base import AbstractProjection
 from .._tree import ravel, tree_stop_gradient, unravel
 
 # The solution in a step, as a function from times of the vector field to vectors.
-Path = Callable[[RealScalarLike], Float[Array, " n"]]
+Interpolant = Callable[[RealScalarLike], Float[Array, " n"]]
 
 
 class TargetManifold(eqx.Module):
@@ -51,9 +51,9 @@ class TargetManifold(eqx.Module):
     displacements: Float[Array, "k n"] | None
 
     def with_rates_integrated(
-        self, start: RealScalarLike, end: RealScalarLike, path: Path
+        self, start: RealScalarLike, end: RealScalarLike, interpolant: Interpolant
     ) -> "TargetManifold":
-        """The target at a time `end` in a step, given the `path` of the solution from `start`.
+        """The target at a time `end` in a step, given the solution from `start`.
 
         The integral over the step is added to the integrals so far by compensated summation (W.
         Kahan, "Further remarks on reducing truncation errors", *Comm. ACM* 8 (1965), 40). So their
@@ -61,7 +61,7 @@ class TargetManifold(eqx.Module):
         """
         if self.rate_integrals is None:
             return self
-        states = lambda t: unravel(path(t), self.like)  # noqa: E731
+        states = lambda t: unravel(interpolant(t), self.like)  # noqa: E731
         return self._plus(ravel(integrated_rates(self.manifold, start, end, states, self.args)))
 
     def _plus(self, increment: Float[Array, " m"]) -> "TargetManifold":
@@ -89,8 +89,8 @@ class TargetManifold(eqx.Module):
             NOISE_IN_EPS / TOLERANCE_IN_EPS * problem.tolerance(problem.scale(jacobian, y)) / 2
         )
         follow = residual - jnp.clip(residual, -half_noise, half_noise)
-        goes_on = (self.rate_integrals[0] != 0) & jnp.isfinite(residual)
-        return self._plus(jnp.where(goes_on, follow, 0))
+        is_shifted = (self.rate_integrals[0] != 0) & jnp.isfinite(residual)
+        return self._plus(jnp.where(is_shifted, follow, 0))
 
     def problem(
         self, t: RealScalarLike, y: Float[Array, " n"], step: Step | None = None
