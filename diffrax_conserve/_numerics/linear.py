@@ -111,9 +111,8 @@ def ldu_factors(
     matrix = jnp.where(on_diagonal, matrix + relative_shift[None] * matrix, matrix)
     size = jnp.abs(_diagonal(matrix))
 
-    def pivots_of(matrix: Array) -> Array:
-        pivots = _diagonal(matrix)
-        return jnp.where(jnp.abs(pivots) <= pivot_tolerance * size, jnp.inf, pivots)
+    def nonzero(pivot: Array, size: Array) -> Array:
+        return jnp.where(jnp.abs(pivot) <= pivot_tolerance * size, jnp.inf, pivot)
 
     def eliminate(k: Array | int, now: tuple[Array, Any], pivoting: bool) -> tuple[Array, Any]:
         matrix, pivot_step = now
@@ -122,24 +121,28 @@ def ldu_factors(
             relative_pivot = jnp.abs(_diagonal(matrix)) / jnp.where(size > 0, size, 1)
             relative_pivot = jnp.where(is_remaining, relative_pivot, -1)
             is_k = j == jnp.argmax(relative_pivot, axis=0, keepdims=True)
+            row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0)
+            column = jnp.sum(jnp.where(is_k[None], matrix, 0), axis=1)
+            pivot = jnp.sum(
+                jnp.where(is_k, nonzero(_diagonal(matrix), size), 0), axis=0, keepdims=True
+            )
         else:
-            is_k = j == k
-        row = jnp.sum(jnp.where(is_k[:, None], matrix, 0), axis=0)
-        column = jnp.sum(jnp.where(is_k[None], matrix, 0), axis=1)
-        pivot = jnp.sum(jnp.where(is_k, pivots_of(matrix), 0), axis=0, keepdims=True)
+            is_k, at_k = j == k, ft.partial(lax.dynamic_index_in_dim, index=k)
+            row, column = (at_k(matrix, axis=axis, keepdims=False) for axis in (0, 1))
+            pivot = nonzero(at_k(row), at_k(size))
         row, column = jnp.where(is_k, 1, row) / pivot, jnp.where(is_k, 1, column)
         rest = jnp.where(is_k[:, None] | is_k[None], 0, matrix) - column[:, None] * row[None]
         is_remaining = is_remaining & ~is_k
         matrix = jnp.where(is_remaining[:, None] | is_remaining[None], rest, matrix)
         return matrix, pivot_step + is_k.astype(int) * (k - m)
 
-    pivot_step = np.full((m, *lanes), m)
+    pivot_step = np.full((m, *lanes) if pivoting else j.shape, m)
     if m > 1:  # all relative pivots are one, so that the natural order will do
         matrix, pivot_step = eliminate(0, (matrix, pivot_step), False)
     if m > 2:
         steps = ft.partial(eliminate, pivoting=pivoting)
         matrix, pivot_step = lax.fori_loop(1, m - 1, steps, (matrix, pivot_step))
-    return jnp.where(on_diagonal, pivots_of(matrix), matrix), pivot_step
+    return jnp.where(on_diagonal, nonzero(_diagonal(matrix), size), matrix), pivot_step
 
 
 def _diagonal(matrix: Float[Array, "m m *lanes"]) -> Float[Array, "m *lanes"]:
@@ -159,8 +162,8 @@ def ldu_solution(
     # gradients are nearly parallel, the multipliers are large and cancel, so that all that uses one
     # must see the same number.
     x = b.astype(factors.dtype)
-    x = (x + unrolled_matvec(jnp.where(row_step > column_step, factors, 0), x)) / pivots
-    return (x + unrolled_matvec(jnp.where(row_step < column_step, factors, 0), x)).astype(b.dtype)
+    x = (x + unrolled_matvec(factors, x, where=row_step > column_step)) / pivots
+    return (x + unrolled_matvec(factors, x, where=row_step < column_step)).astype(b.dtype)
 
 
 def natural_order(m: int, lanes: Sequence[int]) -> np.ndarray:
@@ -168,10 +171,18 @@ def natural_order(m: int, lanes: Sequence[int]) -> np.ndarray:
     return np.arange(m).reshape(m, *[1] * len(lanes))
 
 
-def unrolled_matvec(matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"]) -> Array:
-    """`matrix x`, as a sum that is written out, which XLA fuses with what is around it."""
-    columns = zip(jnp.unstack(matrix, axis=1), jnp.unstack(x), strict=True)
-    return ft.reduce(op.add, (column * element[None] for column, element in columns))
+def unrolled_matvec(
+    matrix: Float[Array, "m n *lanes"], x: Float[Array, "n *lanes"], where: Any = None
+) -> Array:
+    """`matrix x`, as a sum that is written out, which XLA fuses with what is around it. Only the
+    elements `where` a mask is set take part."""
+    columns = jnp.unstack(matrix, axis=1)
+    if where is not None:
+        columns = (jnp.where(where[:, i], y, 0) for i, y in enumerate(columns))
+    terms = (
+        column * element[None] for column, element in zip(columns, jnp.unstack(x), strict=True)
+    )
+    return ft.reduce(op.add, terms)
 
 
 def iterative_refinement(
