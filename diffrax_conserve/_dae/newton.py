@@ -24,20 +24,28 @@ MAX_NEWTON_STEPS = 500
 Residual = Callable[[Array], Array]
 
 
-def solve_equilibrated(matrix: Float[Array, "m m"], b: Float[Array, " m"]) -> Float[Array, " m"]:
-    """`matrix⁻¹ b`, computed in units in which all elements are about one."""
+def solve_equilibrated(
+    matrix: Float[Array, "m m"], b: Float[Array, " m"], leading: Bool[Array, " m"] | None = None
+) -> Float[Array, " m"]:
+    """`matrix⁻¹ b`, computed in units in which all elements are about one. The units of the
+    equations come from the `leading` columns alone, where a row has an element in one of them; by
+    default from all."""
     if b.size == 1:
         return b / matrix[0]
-    rows, columns = lax.stop_gradient(_row_and_column_scales(matrix))
+    rows, columns = lax.stop_gradient(_row_and_column_scales(matrix, leading))
     return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
 
 
 def _row_and_column_scales(
-    jacobian: Float[Array, "m m"],
+    jacobian: Float[Array, "m m"], leading: Bool[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """The units of equations and unknowns, in which no entry is larger than one."""
-    rows = jnp.max(jnp.abs(jacobian), axis=1)
-    return rows, jnp.max(jnp.abs(jacobian) / rows[:, None], axis=0)
+    sizes = jnp.abs(jacobian)
+    rows = jnp.max(sizes, axis=1)
+    if leading is not None:
+        largest = jnp.max(jnp.where(leading, sizes, 0), axis=1)
+        rows = jnp.where(largest > 0, largest, rows)
+    return rows, jnp.max(sizes / rows[:, None], axis=0)
 
 
 class _Factored(NamedTuple):

@@ -19,6 +19,7 @@ from .._numerics.iterate import Solved, iterate, remaining_after_step
 from .._numerics.lanes import where_active
 from .._options import check_counts
 from .._projection.options import check_state, option, refuse_half_precision
+from .._solver.failure import no_time_passes
 from .._solver.terms import in_field_time, vector_fields
 from .._time import nonzero_length
 from .._tree import eps_of, ravel, unravel
@@ -231,8 +232,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         coefficients = jnp.asarray(np.linalg.inv(_POWERS), start.dtype) @ increments
         ok = found.ok & jnp.all(jnp.isfinite(error))
         # The shortest step reports no error, so that it is accepted, and its result ends the solve.
-        shortest = jnp.abs(t1 - t0) <= TOLERANCE_IN_EPS * eps_of(t1) * jnp.abs(t1)
-        big = jnp.where(shortest, 0, float(jnp.finfo(start.dtype).max) ** 0.5)
+        is_shortest = no_time_passes(t1 - t0, jnp.abs(t1))
+        big = jnp.where(is_shortest, 0, float(jnp.finfo(start.dtype).max) ** 0.5)
         error = lax.stop_gradient(jnp.where(ok, error, big.astype(start.dtype)))
         success, failure = dfx.RESULTS.successful, dfx.RESULTS.nonlinear_divergence
         result = dfx.RESULTS.where(found.ok, success, failure)  # pyright: ignore

@@ -25,6 +25,7 @@ from .._large.klu import (
     why_not,
 )
 from .._numerics.linear import lu_factors, lu_solution
+from .newton import solve_equilibrated
 
 # `F(t, y, y')` of vectors.
 Residual = Callable[..., Array]
@@ -41,12 +42,8 @@ def _stages_solution(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Floa
     its largest element. The blocks off the diagonal are `∂F/∂y'` alone, up to a factor.
     """
     n = len(b) // 3
-    has_slopes = jnp.tile(jnp.any(matrix[:n, n : 2 * n] != 0, axis=0), 3)
-    sizes = lax.stop_gradient(jnp.abs(matrix))
-    rows = jnp.max(jnp.where(has_slopes, sizes, 0), axis=1)
-    rows = jnp.where(rows > 0, rows, jnp.max(sizes, axis=1))
-    columns = jnp.max(sizes / rows[:, None], axis=0)
-    return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
+    has_slopes = jnp.any(matrix[:n, n : 2 * n] != 0, axis=0)
+    return solve_equilibrated(matrix, b, jnp.tile(has_slopes, 3))
 
 
 class DenseSystems(NamedTuple):

@@ -9,13 +9,13 @@ contradict each other. There are three ways to solve such a system.
 
 - Up to four constraints: Gaussian elimination with diagonal pivoting, written out in scalars in
   derivatives and for starts far away (`forward_elimination`), and as a loop in the simplified
-  Newton iteration and in `RATTLE` (`ldu_factors`). The
-  next constraint is that whose gradient has the largest angle to the span of the gradients before
-  it. If the gradient is in this span, its pivot is roundoff, and the multiplier is set to zero: if
-  the other constraints hold, this one holds too. Gradients that are only nearly parallel are all
-  kept, because a correction needs the direction in which they differ. A derivative does not need
-  it, and would lose its digits in that direction; see `implicit`. Below double precision, the last
-  iteration, which only polishes, does not need it either; see `iterate`.
+  Newton iteration and in `RATTLE` (`ldu_factors`). The next constraint is that whose gradient has
+  the largest angle to the span of the gradients before it. If the gradient is in this span, its
+  pivot is roundoff, and the multiplier is set to zero: if the other constraints hold, this one
+  holds too. Gradients that are only nearly parallel are all kept, because a correction needs the
+  direction in which they differ. A derivative does not need it, and would lose its digits in that
+  direction; see `implicit`. Below double precision, the last iteration, which only polishes, does
+  not need it either; see `iterate`.
 - More constraints: elimination without pivoting for up to sixteen, otherwise LU factors by LAPACK,
   with a small share of the diagonal added, so that no pivot vanishes. In a derivative the share is
   the least pivot that counts, so that smaller ones have hardly an effect.

@@ -112,7 +112,12 @@ def is_shortest_step(
     """
     size = jnp.abs(candidate)
     at_rest = jnp.all(change <= TOLERANCE_IN_EPS * eps_of(size) * size)
-    return at_rest | (jnp.abs(length) <= TOLERANCE_IN_EPS * eps_of(length) * time)
+    return at_rest | no_time_passes(length, time)
+
+
+def no_time_passes(length: RealScalarLike, time: RealScalarLike) -> Bool[Array, ""]:
+    """Whether the length of a step is roundoff of a time."""
+    return jnp.abs(length) <= TOLERANCE_IN_EPS * eps_of(length) * time
 
 
 def nan_if_failed(
