@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._constants import MIN_KLU
+from .._constants import MAX_STEPS, MIN_KLU
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.run_once import RunOnce
 from .._hashable import Hashable
@@ -30,12 +30,13 @@ from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
 from .._options import check_function
-from .._projection.base import AbstractProjection, check_projection, with_options
+from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, refuse_half_precision
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
+from .free_unknowns import nearest_with_free
 from .large import SparseMatrix
 from .large_search import NotFound
 from .newton import (
@@ -649,6 +650,10 @@ class ConstraintProjection(AbstractProjection):
         if structure.index != 1:
             metric, one = problem.factor, jnp.ones_like(candidate)
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
+            if structure.shares_free:
+                found = _nearest(self.dae, structure, problem, candidate, sizes)
+                info = problem.report(candidate, found.y, found.num_iterations, ok=found.ok)
+                return found.y, info
             jacobian = tree_stop_gradient(problem.linearise(candidate)[1])
             free = Diagonal(structure.equilibrated_units(sizes, jacobian))
             y, info = SimplifiedNewton().solve(dataclasses.replace(problem, factor=free), candidate)
@@ -675,27 +680,53 @@ def _consistent(
     if moves is None and structure.index == 1:
         found = unravel(_solved_for(dae, t, y, args, algebraic_newton)[0], y)
         return found, tree_all_finite(found)
-    units = structure.units(ravel(y).dtype)
-    if moves is not None:
-        units = jnp.where(moves, units, 0)
-    none = jnp.zeros(sum(len(structure.left(k)) for k in range(structure.index)), units.dtype)
+    movable = jnp.ones(structure.size, bool) if moves is None else jnp.asarray(moves)
+    count = sum(len(structure.left(k)) for k in range(structure.index))
+    none = jnp.zeros(count, ravel(y).dtype)
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
-        asked, free = stage
+        asked, moving = stage
         manifold = {"equations": Constraint(_Constraints(dae, asked))}
         cancellation = cancellation_scale(manifold, t, y, args)[2]
-        metric = unravel(jnp.where(free, units, 0) ** -2, y)
-        projection = SimplifiedNewton(metric=metric, max_steps=MAX_NEWTON_STEPS)
-        vector = ravel(y)
+        vector, moving = ravel(y), moving & movable
         problem = problem_of(manifold, none, t, y, args, cancellation)
-        found, info = projection.solve(with_options(problem, projection, vector), vector)
+        sizes = moving.astype(vector.dtype)
+        if structure.shares_free:
+            found = _nearest(dae, structure, problem, vector, sizes, moving, MAX_NEWTON_STEPS)
+            return unravel(found.y, y), found.ok
+        units = structure.equilibrated_units(sizes, problem.linearise(vector)[1])
+        problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
+        found, info = SimplifiedNewton(max_steps=MAX_NEWTON_STEPS).solve(problem, vector)
         return unravel(found, y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.
-    stages = structure.search_stages(freely=moves is None)
+    stages = structure.search_stages(freely=moves is None and not structure.shares_free)
     found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
     return found, ok[-1]
+
+
+def _nearest(
+    dae: DAE,
+    structure: Structure,
+    problem: Problem,
+    candidate: Float[Array, " n"],
+    sizes: Float[Array, " n"],
+    moves: Bool[Array, " n"] | None = None,
+    max_steps: int = MAX_STEPS,
+) -> Solved:
+    """The nearest state on the constraints, with unknowns of these sizes, unless they are free, and
+    of which only some move if that is given."""
+    state = problem.state(candidate)
+    equations = dae._equations(problem.t, state, problem.args)
+    reduction = Reduction(structure, equations, problem.t, candidate)
+    along, free = reduction.mass_null_space(problem.t, candidate)
+    if isinstance(along, SparseMatrix):
+        along = jnp.asarray(along.matrix.toarray(), candidate.dtype)
+    along = lax.stop_gradient(along)
+    some = True if moves is None else ~jnp.any((along != 0) & ~moves[:, None], 0)
+    units = lax.stop_gradient(sizes).at[free].set(0)
+    return nearest_with_free(problem, candidate, units, along, some, max_steps=max_steps)
 
 
 @eqx.filter_jit

@@ -35,6 +35,9 @@ MAX_INDEX = 3
 # A matrix of eliminated slopes with more than this many elements for each row is given up: each
 # constraint would contain so many unknowns.
 _MOST_TERMS = 64
+# If constraints share the unknowns without slopes, a projection solves a dense system; see
+# `free_unknowns`. With more of both than this it would take seconds.
+_MOST_SHARED = 1000
 # So many equations are solved one after the other for a slope that a constraint needs.
 _LEVELS = 8
 
@@ -148,7 +151,16 @@ def find_large_structure(
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
     large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
-    structure = dataclasses.replace(structure, large=large)
+    with_free = gradients[:, structure.free]
+    with_free = with_free[~_empty(with_free, 1)]
+    shares_free = len(extended(with_free, (none, none))[0]) < with_free.shape[0]
+    structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
+    num_shared = gradients.shape[0] + structure.free.size
+    if structure.index > 1 and shares_free and num_shared > _MOST_SHARED:
+        raise NotFound(
+            f"{gradients.shape[0]} constraints share {structure.free.size} unknowns without slopes, "
+            f"and more than {_MOST_SHARED} of both cannot be told apart by sparse matrices"
+        )
     if all(met):
         structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
     return structure

@@ -25,15 +25,16 @@ Residual = Callable[[Array], Array]
 
 
 def solve_equilibrated(
-    matrix: Float[Array, "m m"], b: Float[Array, " m"], leading: Bool[Array, " m"] | None = None
-) -> Float[Array, " m"]:
+    matrix: Float[Array, "m m"], b: Float[Array, "m *k"], leading: Bool[Array, " m"] | None = None
+) -> Float[Array, "m *k"]:
     """`matrix⁻¹ b`, computed in units in which all elements are about one. The units of the
     equations come from the `leading` columns alone, where a row has an element in one of them; by
     default from all."""
-    if b.size == 1:
+    if len(b) == 1:
         return b / matrix[0]
     rows, columns = lax.stop_gradient(_row_and_column_scales(matrix, leading))
-    return jnp.linalg.solve(matrix / rows[:, None] / columns, b / rows) / columns
+    scaled = matrix / rows[:, None] / columns
+    return (jnp.linalg.solve(scaled, (b.T / rows).T).T / columns).T
 
 
 def _row_and_column_scales(

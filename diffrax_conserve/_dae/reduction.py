@@ -63,6 +63,8 @@ class Structure:
       before do not, such as positions, velocities and forces; empty if not all constraints can be
       met by these alone.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
+    - `shares_free`: whether the free unknowns are in more constraints than they can meet, so that
+      these constrain other unknowns too, as where cells in parallel have one voltage.
     - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
 
@@ -73,6 +75,7 @@ class Structure:
     is_semi_explicit: bool = False
     new_unknowns: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
+    shares_free: bool = False
     large: Large | None = None
 
     def _values(self) -> tuple[Any, ...]:
@@ -116,25 +119,23 @@ class Structure:
         return tuple(i for i in range(self.size) if i not in solved)
 
     @property
-    def algebraic(self) -> tuple[int, ...]:
-        """The unknowns for whose slopes no equation is solved before the last differentiation."""
-        known = set(self.rounds[-1].slopes if self.rounds else range(self.size))
-        return tuple(j for j in range(self.size) if j not in known)
-
-    def units(self, dtype: Any) -> Float[Array, " n"]:
-        """The units of a projection in which unknowns without slopes, such as forces, are free:
-        what they can correct moves no other unknown. Those of the others are one."""
-        return jnp.where(self._is_free, jnp.asarray(1 / eps_of(dtype), dtype), 1)
+    def free(self) -> np.ndarray:
+        """The unknowns for whose slopes the equations, as they are given, are not solved, such as
+        forces. A projection moves them as far as the constraints ask for."""
+        known = self.rounds[0].slopes if self.rounds else range(self.size)
+        return np.setdiff1d(np.arange(self.size), np.array(known, int))
 
     def equilibrated_units(
         self, sizes: Float[Array, " n"], jacobian: AbstractRows
     ) -> Float[Array, " n"]:
-        """As `units`, for a constraint Jacobian. The units of unknowns with slopes are their sizes.
-        The sizes of those without slopes may have any ratios, as at a start where some
-        vanish, and a Gram matrix would square these. So the units of these unknowns come from the
-        Jacobian, equilibrated as by LAPACK's `geequ`: first each row is divided by its largest
-        element, then each column. All are so large that they exceed in each row that has some what
-        the other unknowns contribute, by the factor `1/ε`."""
+        """The units of a projection in which free unknowns, such as forces, are free: what they can
+        correct moves no other unknown. Those of the others are their sizes.
+
+        The sizes of free unknowns may have any ratios, as at a start where some vanish, and a Gram
+        matrix would square these. So their units come from the constraint Jacobian, equilibrated as
+        by LAPACK's `geequ`: first each row is divided by its largest element, then each column. All
+        are so large that they exceed in each row that has some what the other unknowns contribute,
+        by the factor `1/ε`."""
         others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest_in_rows()
         free = jacobian.scale_columns(jnp.asarray(self._is_free, sizes.dtype))
         largest = free.largest_in_rows()
@@ -146,7 +147,7 @@ class Structure:
 
     @property
     def _is_free(self) -> Bool[np.ndarray, " n"]:
-        return np.isin(np.arange(self.size), self.algebraic)
+        return np.isin(np.arange(self.size), self.free)
 
     def search_stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are
@@ -278,9 +279,8 @@ class Reduction:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""
-        structure = self.structure
+        structure, free = self.structure, self.structure.free
         rows, columns = (np.array(x, int) for x in structure.rounds[0])
-        free = np.setdiff1d(np.arange(structure.size), columns)
         if structure.large is not None:
             return structure.large.along, free
         matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
@@ -390,6 +390,10 @@ def find_structure(
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
+    with_free = gradients[:, structure.free]
+    with_free = with_free[with_free.any(1)]
+    shares_free = len(_extended(with_free, _NONE).equations) < len(with_free)
+    structure = dataclasses.replace(structure, shares_free=shares_free)
     if all(met):
         found = tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns)
         structure = dataclasses.replace(structure, new_unknowns=found)

@@ -183,3 +183,84 @@ test_wrong_arguments = refused(
         "`projection` is",
     ),
 )
+
+
+# ---- Unknowns without slopes that are in more constraints than they can meet ----
+
+
+def pendulum_with(output):
+    """Of index 3, with a further unknown that is a function of the others."""
+
+    def residual(t, y, dy, args):
+        (q, v, force, further), (dq, dv, _, _) = y, dy
+        down = jnp.array([0.0, -GRAVITY], q.dtype)
+        return dq - v, dv + force * q - down, jnp.sum(q**2) - 1, output(further, q, v, force)
+
+    return dfc.DAE(residual=residual)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize(
+    "output",
+    [
+        lambda z, q, v, force: z - 0.3 * force,
+        lambda z, q, v, force: z - 2e3 * force,
+        lambda z, q, v, force: z * jnp.exp(q[0]) - q[1] * v[0] * force,
+    ],
+    ids=["a share of the force", "the force in another unit", "a nonlinear function of all"],
+)
+def test_an_output_changes_nothing(output, dtype):
+    """The states are those without it, and so is their derivative by the first angle."""
+    alone, eps = pendulum_with(lambda z, q, v, force: z - 1), jnp.finfo(dtype).eps
+
+    def end(dae, angle):
+        q = jnp.stack([jnp.sin(angle), -jnp.cos(angle)]).astype(dtype)
+        v = 0.5 * jnp.stack([jnp.cos(angle), jnp.sin(angle)]).astype(dtype)
+        y0 = dae.consistent((q, v, jnp.ones((), dtype), jnp.ones((), dtype)))
+        found = solve(dae, dae.wrap(dfx.Tsit5()), jnp.array([0.0, 0.3], dtype), y0, dt0=0.03)
+        return (y0[:3], found.ys[:3]), found.result
+
+    both = [
+        jax.jit(lambda x, dae=dae: jax.jvp(lambda x: end(dae, x), (x,), (1.0,)))(0.7)
+        for dae in (alone, pendulum_with(output))
+    ]
+    for (_, result), _ in both:
+        assert result == dfx.RESULTS.successful
+    (expected, _), (t_expected, _) = both[0]
+    (same, _), (t_same, _) = both[1]
+    for a, b in zip(jax.tree.leaves((expected, t_expected)), jax.tree.leaves((same, t_same)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=200 * eps, atol=200 * eps)
+
+
+@pytest.mark.parametrize("solver", [dfc.Radau(), dfx.Tsit5()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("names", [np.eye(2), np.array([[1.0, 1.0], [1.0, -1.0]])])
+def test_cells_in_parallel_share_the_current(solver, names):
+    """Two linear ones, of index 2, so that each has its share of the charge for ever, whatever the
+    two unknown currents are: those of the cells, or their sum and their difference."""
+    names = jnp.asarray(names)
+
+    def f(t, x, z, capacities):
+        return 1e-3 * (names @ z[:2]) / capacities
+
+    def algebraic(t, x, z, capacities):
+        return jnp.append(4.3 - 0.75 * x - z[2], jnp.sum(names @ z[:2]) - 10)
+
+    dae, time = dfc.DAE(f, algebraic=algebraic), 100.0
+
+    def end(first):
+        capacities = jnp.stack([first, jnp.array(1.1)])
+        y0 = dae.consistent(jnp.full(2, 0.3), jnp.array([1.0, 2.0, 3.0]), args=capacities)
+        found = solve(dae, dae.wrap(solver), jnp.array([0.0, time]), y0, capacities)
+        x, z = jax.tree.map(lambda x: x[-1], found.ys)
+        return (x, names @ z[:2], z[2]), found.result
+
+    (state, result), (by_first, _) = jax.jit(lambda x: jax.jvp(end, (x,), (1.0,)))(1.0)
+    assert result == dfx.RESULTS.successful
+    charge, total = 0.3 + 1e-2 * time / 2.1, 2.1
+    exact = np.full(2, charge), 10 * np.array([1.0, 1.1]) / total, 4.3 - 0.75 * charge
+    for a, b in zip(state, exact, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+    slope = -1e-2 * time / total**2
+    exact = np.full(2, slope), np.array([11.0, -11.0]) / total**2, -0.75 * slope
+    for a, b in zip(by_first, exact, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-11)

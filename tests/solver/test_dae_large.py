@@ -97,6 +97,21 @@ def chain(n):
     return dfc.DAE(residual=residual), ((q, jnp.zeros((n, 2)), jnp.zeros(n), jnp.array(0.5)),)
 
 
+def cells(n):
+    """In parallel: index 2, in which all have one voltage, and the currents one sum."""
+
+    def f(t, x, z, args):
+        within = jnp.diff(x, axis=1, prepend=x[:, :1], append=x[:, -1:])
+        return jnp.diff(within, axis=1).at[:, -1].add(-z[:-1] / jnp.linspace(1, 2, n))
+
+    def algebraic(t, x, z, args):
+        potential = 4 - x[:, -1] - 0.1 * x[:, -1] ** 3
+        return jnp.append(potential - z[-1], jnp.sum(z[:-1]) - n)
+
+    guess = jnp.full((n, 3), 0.5), jnp.append(jnp.ones(n), 3.5)
+    return dfc.DAE(f, algebraic=algebraic), guess
+
+
 def explicit(n):
     """Index 0, with slopes that are coupled."""
 
@@ -107,7 +122,8 @@ def explicit(n):
 
 
 SMALL = [
-    (explicit, 5), (heat, 9), (ladder, 8), (ring, 7), (varying, 8), (pairs, 4), (chain, 3),
+    (explicit, 5), (heat, 9), (ladder, 8), (ring, 7), (varying, 8), (pairs, 4), (cells, 3),
+    (chain, 3),
 ]  # fmt: skip
 
 
@@ -155,7 +171,7 @@ def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypa
 
 
 # The law before has found the structure of each.
-@of_all_but(explicit, heat, ring, varying, chain)
+@of_all_but(explicit, heat, ring, varying, cells, chain)
 def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monkeypatch):
     def values(least):
         dae, guess, *_ = made(make, n, least, monkeypatch)
@@ -168,10 +184,10 @@ def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monke
 
 
 @pytest.mark.parametrize(
-    ("make", "n"), [(pairs, 60), pytest.param(chain, 24, marks=pytest.mark.slow)]
+    ("make", "n"), [(pairs, 60), (cells, 30), pytest.param(chain, 24, marks=pytest.mark.slow)]
 )
 def test_consistent_states_of_a_higher_index_are_those_of_dense_matrices(make, n, monkeypatch):
-    """With 120 unknowns, index 2 and 3; and inside of another program."""
+    """With 120 or 121 unknowns, index 2 and 3; and inside of another program."""
 
     def values(least):
         dae, _, y, structure = made(make, n, least, monkeypatch)

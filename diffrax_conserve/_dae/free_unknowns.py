@@ -1,0 +1,101 @@
+"""The nearest state on the constraints, where some unknowns are free.
+
+The equations `F(t, y, y') = 0` do not differentiate the directions `N` with `∂F/∂y' N = 0`, such as
+forces and currents. A state moves along them as far as the constraints ask for, and in all other
+directions as little as possible. So a change of the state is `δ = S e + N z`, with the units `S` of
+the unknowns that are not free, and for a residual `r`
+
+    min |e|²/2  subject to  A e + B z = r,    A = G S,  B = G N,
+
+where `G` is the constraint Jacobian. The result is `e = Aᵀ μ`, with
+
+    [A Aᵀ  B] [μ]   [r]
+    [Bᵀ    0] [z] = [0].
+
+Elsewhere free unknowns are those with large units. That does not do where they are in more
+constraints than they can meet: where cells in parallel have one voltage, the differences of its
+constraints are a relation of their charges, and large units would hide it by roundoff.
+"""
+
+import jax.lax as lax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from .._numerics.implicit import root
+from .._numerics.iterate import Solved, iterate, remaining_after_test
+from .._numerics.lanes import where_active
+from .._numerics.problem import Problem
+from .newton import solve_equilibrated
+
+
+def nearest_with_free(
+    problem: Problem,
+    candidate: Float[Array, " n"],
+    units: Float[Array, " n"],
+    along: Float[Array, "n f"],
+    moves: Bool[Array, " f"] | bool = True,
+    *,
+    max_steps: int,
+) -> Solved:
+    """The state on the manifold that is nearest to a candidate, by Newton's method.
+
+    The directions of the corrections are those at the candidate, and have no derivative.
+
+    - `units`: of the unknowns that are not free, zero for all others and for what does not move.
+    - `along`: the columns of `N`.
+    - `moves`: along which of them the state may move.
+    """
+    problem = problem.with_dense_jacobian()
+    _, rows = problem.linearise(candidate)
+    directions = lax.stop_gradient(_directions(rows.matrix, units, along, moves))
+
+    def state(multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
+        return candidate + directions @ multiplier
+
+    def residual(multiplier: Float[Array, " m"]) -> Float[Array, " m"]:
+        return problem.residual(state(multiplier))
+
+    def newton(begin: Float[Array, " m"]) -> Solved:
+        def advance(multiplier: Array, tests_left: Array) -> tuple[Array, Array]:
+            y = state(multiplier)
+            g, rows = problem.linearise(y)
+            status, to_correct = problem.status(g, problem.scale(rows, y))
+            tests_left = remaining_after_test(status, tests_left)
+            change = solve_equilibrated(rows.matrix @ directions, to_correct)
+            return where_active(tests_left, multiplier - change, multiplier), tests_left
+
+        return iterate(advance, begin, max_steps=max_steps)
+
+    none = jnp.zeros(problem.num_residuals, candidate.dtype)
+    found = root(residual, newton, none, solve_equilibrated)
+    return found._replace(y=state(found.y))
+
+
+def _directions(
+    jacobian: Float[Array, "m n"],
+    units: Float[Array, " n"],
+    along: Float[Array, "n f"],
+    moves: Bool[Array, " f"] | bool,
+) -> Float[Array, "n m"]:
+    """The changes of the state, one for each constraint, that change its residual alone, by one.
+
+    The linear system is equilibrated: each column of `B` is divided by its largest element, relative
+    to those in its row, and then each row of `A` and `B` by its largest element.
+    """
+    m, f = len(jacobian), along.shape[1]
+    scaled, by_free = jacobian * units, jnp.where(moves, jacobian @ along, 0)
+    columns = _largest(by_free / _largest(by_free, 1), 0)
+    both = jnp.concatenate([scaled, by_free / columns], 1)
+    rows = _largest(both, 1)
+    scaled, by_free = jnp.split(both / rows, [len(units)], axis=1)
+    fixed = jnp.diag(jnp.broadcast_to(jnp.where(moves, 0, 1), f).astype(units.dtype))
+    matrix = jnp.block([[scaled @ scaled.T, by_free], [by_free.T, fixed]])
+    solution = solve_equilibrated(matrix, jnp.eye(m + f, m, dtype=units.dtype))
+    change = units[:, None] * (scaled.T @ solution[:m]) + along @ (solution[m:] / columns.T)
+    return change / rows.T
+
+
+def _largest(matrix: Float[Array, "m n"], axis: int) -> Array:
+    """The largest elements of the rows or columns, one where all are zero."""
+    largest = jnp.max(jnp.abs(matrix), axis=axis, keepdims=True, initial=0)
+    return jnp.where(largest > 0, largest, 1)
