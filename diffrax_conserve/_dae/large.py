@@ -50,11 +50,11 @@ class SparseMatrix:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Elimination:
-    """How the slopes are found that the next constraints need, from the equations at no slopes or
-    one after the other.
+    """How the slopes are found that the next constraints need.
 
-    - `constant`: with a constant `∂F/∂y'` the slopes are this matrix times the equations.
-    - `levels`: otherwise, rows and columns of equations with one slope that is not yet known.
+    - `constant`: where `∂F/∂y'` is constant, slopes are this matrix times the equations at no
+      slopes; `None` if there are none of these.
+    - `levels`: for the others, rows and columns of equations with one slope that is not yet known.
     """
 
     constant: SparseMatrix | None = None
@@ -65,7 +65,7 @@ class Elimination:
     ) -> Float[Array, " n"]:
         slopes = jnp.zeros_like(like)
         if self.constant is not None:
-            return self.constant @ equations(slopes)
+            slopes = self.constant @ equations(slopes)
         for rows, columns in self.levels:
             one = jnp.zeros_like(like).at[columns].set(1)
             left, by_slope = jax.jvp(equations, (slopes,), (one,))

@@ -145,11 +145,11 @@ def find_large_structure(
             blamed = left[~np.isin(start + np.arange(len(left)), independent)]
             raise Singular(_tuple(blamed), absent)
         matrix = _replaced(matrix, left, new)
-        needed = np.unique(at.columns)
         kept = ~np.isin(in_places[0], left)
         added = left[at.rows], at.columns
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
+        needed = np.unique(at.columns[~np.isin(left[at.rows], selected[0])])
     large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
     with_free = gradients[:, structure.free]
     with_free = with_free[~_empty(with_free, 1)]
@@ -223,8 +223,8 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 def _with_round(
     structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
 ) -> Large:
-    """What one more round needs, of which the slopes that the constraints before it contain are
-    needed."""
+    """What one more round needs, of which the slopes are needed that are in those constraints before
+    it that it differentiates."""
     rows, columns = selected
     large, k = structure.large, structure.index
     assert large is not None
@@ -250,21 +250,44 @@ def _with_round(
         whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
         whole = whole - _spread(share, None, rows, structure.size)
         return dataclasses.replace(large, combinations=SparseMatrix(whole))
-    needed = np.intersect1d(needed, columns)
-    if constant and given.size == rows.size:
-        at = np.searchsorted(np.sort(columns), needed)
-        at = np.argsort(columns)[at]
-        one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
-        inverse = combinations(one, structure.mass[rows][:, columns])
-        if inverse.nnz > _MOST_TERMS * max(1, len(at)):
-            raise NotFound(
-                "the slopes of too many unknowns are coupled, as those of finite elements with a "
-                "consistent mass matrix: use a diagonal one"
-            )
-        one = Elimination(SparseMatrix(_spread(-inverse, needed, rows, structure.size)))
-    else:
-        one = Elimination(levels=_levels(matrix, rows, columns, needed))
+    needed, closed = np.intersect1d(needed, columns), (np.zeros(0, int), np.zeros(0, int))
+    if constant:
+        closed = _closed(structure.mass, given, columns)
+    levels, needed = _levels(matrix, rows, columns, needed, closed[1])
+    one = Elimination(_inverse(structure.mass, closed, needed), levels)
     return dataclasses.replace(large, eliminations=(*large.eliminations, one))
+
+
+def _closed(
+    mass: sp.csr_array, rows: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Those rows and columns of independent rows that are as many in their connected component, so
+    that these slopes are determined by these equations alone."""
+    part = mass[rows][:, columns]
+    both = sp.block_array([[None, part], [part.T, None]], format="csr")
+    count, component = sp.csgraph.connected_components(both, directed=False)
+    of_rows, of_columns = np.split(component, [rows.size])
+    sizes = (np.bincount(x, minlength=count) for x in (of_rows, of_columns))
+    is_square = np.equal(*sizes)
+    return rows[is_square[of_rows]], columns[is_square[of_columns]]
+
+
+def _inverse(
+    mass: sp.csr_array | None, closed: tuple[np.ndarray, np.ndarray], needed: np.ndarray
+) -> SparseMatrix | None:
+    """The matrix that gives the slopes that are needed from the equations without slopes."""
+    if not needed.size:
+        return None
+    rows, columns = closed
+    at = np.argsort(columns)[np.searchsorted(np.sort(columns), needed)]
+    one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
+    inverse = combinations(one, mass[rows][:, columns])
+    if inverse.nnz > _MOST_TERMS * len(at):
+        raise NotFound(
+            "the slopes of too many unknowns are coupled, as those of finite elements with a "
+            "consistent mass matrix: use a diagonal one"
+        )
+    return SparseMatrix(_spread(-inverse, needed, rows, mass.shape[0]))
 
 
 def _with_slopes(
@@ -308,12 +331,17 @@ def _spread(
 
 
 def _levels(
-    matrix: sp.csr_array, rows: np.ndarray, columns: np.ndarray, needed: np.ndarray
-) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Equations that are solved one after the other, each for one slope that is needed."""
+    matrix: sp.csr_array,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    needed: np.ndarray,
+    given: np.ndarray,
+) -> tuple[tuple[tuple[np.ndarray, np.ndarray], ...], np.ndarray]:
+    """Equations that are solved one after the other, each for one slope that is needed, if some are
+    given; and which of those are needed."""
     at = sp.coo_array(matrix[rows][:, columns])
     i, j = rows[at.coords[0]], columns[at.coords[1]]
-    known, levels = np.zeros(matrix.shape[0], bool), []
+    known, levels = np.isin(np.arange(matrix.shape[0]), given), []
     for _ in range(_LEVELS):
         unsolved = ~known[j]
         counts = np.bincount(i[unsolved], minlength=matrix.shape[0])
@@ -331,7 +359,7 @@ def _levels(
         if some.any():
             kept.append((row[some], column[some]))
         wanted[j[np.isin(i, row[some])]] = True
-    return tuple(reversed(kept))
+    return tuple(reversed(kept)), np.intersect1d(np.flatnonzero(wanted), given)
 
 
 # ---- Numbers ----

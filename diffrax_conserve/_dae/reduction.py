@@ -241,7 +241,7 @@ class Reduction:
         equations, constraints = self.equations, self.constraints
         assert large is not None
         elimination = large.eliminations[k - 1] if k < structure.index else None
-        as_given = elimination is not None and elimination.constant is not None
+        as_given = elimination is not None and not elimination.levels
 
         def slopes(t: Array, y: Array) -> Array:
             def residual(slopes: Array) -> Array:

@@ -228,7 +228,9 @@ def test_an_output_changes_nothing(output, dtype):
         assert result == dfx.RESULTS.successful
     (expected, _), (t_expected, _) = both[0]
     (same, _), (t_same, _) = both[1]
-    for a, b in zip(jax.tree.leaves((expected, t_expected)), jax.tree.leaves((same, t_same)), strict=True):
+    for a, b in zip(
+        jax.tree.leaves((expected, t_expected)), jax.tree.leaves((same, t_same)), strict=True
+    ):
         np.testing.assert_allclose(a, b, rtol=200 * eps, atol=200 * eps)
 
 
