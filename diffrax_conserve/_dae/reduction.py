@@ -162,19 +162,34 @@ class Structure:
 class Reduction:
     """The functions that belong to a structure of equations, for times and vectors like these.
 
-    Each is derived from those before it, and written out as a small program, if the system is small
-    enough, before the next is derived. `constraints(t, y)` returns `h_0` to `h_{ν-1}`.
+    Each is derived from those before it, and written out as a small program before the next is
+    derived. If one of them would be too large in scalars, all stay in arrays: the derivative of a
+    program in scalars, as JAX makes it, is several times as large, and is not written out.
+    `constraints(t, y)` returns `h_0` to `h_{ν-1}`.
     """
 
     def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
         self.like, self.structure = (t, y), structure
+        self._write = small if structure.large is None else folded
+        if not self._derived(equations, t, y):
+            self._write = folded
+            self._derived(equations, t, y)
+
+    def _derived(self, equations: Implicit, t: Array, y: Array) -> bool:
+        """Derives all constraints, and returns whether none was too large after one that was not."""
         self.equations = self.small(equations, t, y, y)
         self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
-        for k in range(structure.index):
-            self.constraints = self.small(self._further(k), t, y)
+        in_scalars = self.equations is not equations
+        for k in range(self.structure.index):
+            further = self._further(k)
+            self.constraints = self.small(further, t, y)
+            if self._write is small and in_scalars and self.constraints is further:
+                return False
+            in_scalars = in_scalars or self.constraints is not further
+        return True
 
     def small(self, fn: Callable[..., Any], *like: Array) -> Callable[..., Any]:
-        return (small if self.structure.large is None else folded)(fn, *like)
+        return self._write(fn, *like)
 
     def _further(self, k: int) -> Callable[[Array, Array], list[Array]]:
         """The constraints with those of round `k`. The first are the equations that are left at the
@@ -233,7 +248,7 @@ class Reduction:
                 ).y
             return jnp.zeros_like(y).at[columns].set(found)
 
-        return small(slopes, *self.like)
+        return self.small(slopes, *self.like)
 
     def _needed_slopes(self, k: int) -> Callable[[Array, Array], Array]:
         """Those slopes of round `k` that its constraints need; after the last one all."""
