@@ -4,9 +4,11 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import diffrax_conserve as dfc
 
+from ..learned import LORENZ, flow_map, solution, unchecked
 from ..problems import EPS, largest
 
 TICK = 0.25
@@ -47,3 +49,18 @@ def test_the_work_of_a_torque_is_the_gain_in_energy_and_a_gradient_goes_through_
     energy = ys[..., 1] ** 2 / 2 - np.cos(ys[..., 0])
     assert largest(np.diff(energy) - torques * np.diff(ys[..., 0])) < 16 * EPS
     assert abs(slope - difference) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("solver", "reason"),
+    [(unchecked(flow_map()), "max_step"), (dfc.PINNSolver(solution()), "outside the interval")],
+    ids=["flow map", "PINN"],
+)
+def test_a_step_that_is_too_long_is_told_by_its_result(solver, reason):
+    """Outside of `jit` too, where its length is known."""
+    term, y0 = dfx.ODETerm(LORENZ.vector_field), LORENZ.y0
+    state = solver.init(term, 0.0, 0.2, y0, None)
+    for end, succeeds in ((0.2, True), (3.0, False)):
+        result = solver.step(term, 0.0, end, y0, None, state, made_jump=False)[4]
+        assert bool(dfx.is_successful(result)) == succeeds
+    assert reason in str(result)

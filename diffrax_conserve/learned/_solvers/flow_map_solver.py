@@ -126,6 +126,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         refused = refused_from_start(self.flow_map, known, self.check_field, *given)
         return _State(refused, StepsOutside.zero(t0) if self._has_domain else None)
 
+    @eqx.filter_jit  # with a traced length, one that is too long is told by the result
     def step(
         self,
         terms: dfx.AbstractTerm,

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import ClassVar, final
 
 import diffrax as dfx
+import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
@@ -84,6 +85,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
         starts = jnp.all(jnp.abs(flatten(tree_sub(y0, state))) <= tolerance * size)
         return jnp.where(self._covers(time), jnp.where(starts, 0, _ANOTHER_START), _OUTSIDE)
 
+    @eqx.filter_jit  # with a traced time, one that is outside is told by the result
     def step(
         self,
         terms: dfx.AbstractTerm,
