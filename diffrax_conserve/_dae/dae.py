@@ -721,8 +721,7 @@ def _nearest(
     equations = dae._equations(problem.t, state, problem.args)
     reduction = Reduction(structure, equations, problem.t, candidate)
     along, free = reduction.mass_null_space(problem.t, candidate)
-    if isinstance(along, SparseMatrix):
-        along = jnp.asarray(along.matrix.toarray(), candidate.dtype)
+    along = along.dense(candidate.dtype) if isinstance(along, SparseMatrix) else along
     along = lax.stop_gradient(along)
     some = True if moves is None else ~jnp.any((along != 0) & ~moves[:, None], 0)
     units = lax.stop_gradient(sizes).at[free].set(0)

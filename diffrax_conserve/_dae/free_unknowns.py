@@ -25,6 +25,7 @@ from .._numerics.implicit import root
 from .._numerics.iterate import Solved, iterate, remaining_after_test
 from .._numerics.lanes import where_active
 from .._numerics.problem import Problem
+from .._numerics.rows import DenseRows
 from .newton import solve_equilibrated
 
 
@@ -45,9 +46,14 @@ def nearest_with_free(
     - `along`: the columns of `N`.
     - `moves`: along which of them the state may move.
     """
-    problem = problem.with_dense_jacobian()
-    _, rows = problem.linearise(candidate)
-    directions = lax.stop_gradient(_directions(rows.matrix, units, along, moves))
+
+    def linearised(y: Float[Array, " n"]) -> tuple[Float[Array, " m"], DenseRows]:
+        g, rows = problem.with_dense_jacobian().linearise(y)
+        assert isinstance(rows, DenseRows)
+        return g, rows
+
+    jacobian = linearised(candidate)[1].matrix
+    directions = lax.stop_gradient(_directions(jacobian, units, along, moves))
 
     def state(multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
         return candidate + directions @ multiplier
@@ -58,7 +64,7 @@ def nearest_with_free(
     def newton(begin: Float[Array, " m"]) -> Solved:
         def advance(multiplier: Array, tests_left: Array) -> tuple[Array, Array]:
             y = state(multiplier)
-            g, rows = problem.linearise(y)
+            g, rows = linearised(y)
             status, to_correct = problem.status(g, problem.scale(rows, y))
             tests_left = remaining_after_test(status, tests_left)
             change = solve_equilibrated(rows.matrix @ directions, to_correct)
@@ -79,8 +85,8 @@ def _directions(
 ) -> Float[Array, "n m"]:
     """The changes of the state, one for each constraint, that change its residual alone, by one.
 
-    The linear system is equilibrated: each column of `B` is divided by its largest element, relative
-    to those in its row, and then each row of `A` and `B` by its largest element.
+    The linear system is equilibrated: each column of `B` is divided by its largest element, as a
+    share of the largest in the row, and then each row of `A` and `B` by its largest element.
     """
     m, f = len(jacobian), along.shape[1]
     scaled, by_free = jacobian * units, jnp.where(moves, jacobian @ along, 0)

@@ -8,8 +8,10 @@ and how slopes are eliminated such that each constraint stays a function of a fe
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
+import jax.lax as lax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -41,6 +43,11 @@ class SparseMatrix:
     @property
     def shape(self) -> tuple[int, int]:
         return self.matrix.shape
+
+    def dense(self, dtype: Any) -> Array:
+        # With the barrier XLA does not keep all zeros as a constant.
+        zeros = lax.optimization_barrier(jnp.zeros(self.shape, dtype))
+        return zeros.at[self.rows, self.columns].set(jnp.asarray(self.values, dtype))
 
     def __matmul__(self, x: Array) -> Array:
         """By gather and scatter, of which the cost is that of the elements."""

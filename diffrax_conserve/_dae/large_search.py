@@ -38,6 +38,7 @@ _MOST_TERMS = 64
 # If constraints share the unknowns without slopes, a projection solves a dense system; see
 # `free_unknowns`. With more of both than this it would take seconds.
 _MOST_SHARED = 1000
+_NOT_CONSTANT = "the coefficients of their slopes are coupled, and not constant"
 # So many equations are solved one after the other for a slope that a constraint needs.
 _LEVELS = 8
 
@@ -155,12 +156,15 @@ def find_large_structure(
     with_free = with_free[~_empty(with_free, 1)]
     shares_free = len(extended(with_free, (none, none))[0]) < with_free.shape[0]
     structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
-    num_shared = gradients.shape[0] + structure.free.size
-    if structure.index > 1 and shares_free and num_shared > _MOST_SHARED:
-        raise NotFound(
-            f"{gradients.shape[0]} constraints share {structure.free.size} unknowns without slopes, "
-            f"and more than {_MOST_SHARED} of both cannot be told apart by sparse matrices"
-        )
+    if structure.index > 1 and shares_free:
+        m, f = gradients.shape[0], structure.free.size
+        if m + f > _MOST_SHARED:
+            raise NotFound(
+                f"{m} constraints share {f} unknowns without slopes, and more than {_MOST_SHARED} "
+                "of both would take a dense matrix"
+            )
+        if large.along is None:
+            raise NotFound(_NOT_CONSTANT)
     if all(met):
         structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
     return structure
@@ -223,8 +227,8 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 def _with_round(
     structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
 ) -> Large:
-    """What one more round needs, of which the slopes are needed that are in those constraints before
-    it that it differentiates."""
+    """What one more round needs. It differentiates some of the constraints before it, and needs the
+    slopes of the unknowns in these."""
     rows, columns = selected
     large, k = structure.large, structure.index
     assert large is not None
@@ -250,9 +254,10 @@ def _with_round(
         whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
         whole = whole - _spread(share, None, rows, structure.size)
         return dataclasses.replace(large, combinations=SparseMatrix(whole))
-    needed, closed = np.intersect1d(needed, columns), (np.zeros(0, int), np.zeros(0, int))
+    closed = rows[:0], columns[:0]
     if constant:
         closed = _closed(structure.mass, given, columns)
+    needed = np.intersect1d(needed, columns)
     levels, needed = _levels(matrix, rows, columns, needed, closed[1])
     one = Elimination(_inverse(structure.mass, closed, needed), levels)
     return dataclasses.replace(large, eliminations=(*large.eliminations, one))
@@ -273,7 +278,7 @@ def _closed(
 
 
 def _inverse(
-    mass: sp.csr_array | None, closed: tuple[np.ndarray, np.ndarray], needed: np.ndarray
+    mass: Any, closed: tuple[np.ndarray, np.ndarray], needed: np.ndarray
 ) -> SparseMatrix | None:
     """The matrix that gives the slopes that are needed from the equations without slopes."""
     if not needed.size:
@@ -299,7 +304,7 @@ def _with_slopes(
     if structure.index != 1:
         return large
     if large.along is None:
-        raise NotFound("the coefficients of their slopes are coupled, and not constant")
+        raise NotFound(_NOT_CONSTANT)
     moved = abs(_combined(structure)) @ _ones(by_y) @ abs(large.along.matrix)
     return dataclasses.replace(large, by_free=_jacobian(moved))
 

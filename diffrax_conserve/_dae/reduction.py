@@ -168,7 +168,7 @@ class Reduction:
     `constraints(t, y)` returns `h_0` to `h_{ν-1}`.
     """
 
-    def __init__(self, structure: Structure, equations: Implicit, t: Array, y: Array):
+    def __init__(self, structure: Structure, equations: Implicit, t: Any, y: Array):
         self.like, self.structure = (t, y), structure
         self._write = small if structure.large is None else folded
         if not self._derived(equations, t, y):
@@ -176,7 +176,7 @@ class Reduction:
             self._derived(equations, t, y)
 
     def _derived(self, equations: Implicit, t: Array, y: Array) -> bool:
-        """Derives all constraints, and returns whether none was too large after one that was not."""
+        """Derives all constraints. It fails if one is too large after one that is not."""
         self.equations = self.small(equations, t, y, y)
         self.constraints: Callable[[Array, Array], list[Array]] = lambda t, y: []
         in_scalars = self.equations is not equations
@@ -290,7 +290,7 @@ class Reduction:
             values = values.at[np.array(self.structure.left(k), int)].set(rate)
         return values
 
-    def mass_null_space(self, t: Array, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
+    def mass_null_space(self, t: Any, y: Float[Array, " n"]) -> tuple[Any, np.ndarray]:
         """A basis of the directions `d` with `∂F/∂y' d = 0`, in which a state may be moved without
         what the equations differentiate, such as the charges of condensers; and which unknowns are
         the coordinates along it."""

@@ -199,13 +199,12 @@ def pendulum_with(output):
     return dfc.DAE(residual=residual)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 @pytest.mark.parametrize(
-    "output",
+    ("output", "dtype"),
     [
-        lambda z, q, v, force: z - 0.3 * force,
-        lambda z, q, v, force: z - 2e3 * force,
-        lambda z, q, v, force: z * jnp.exp(q[0]) - q[1] * v[0] * force,
+        (lambda z, q, v, force: z - 0.3 * force, jnp.float64),
+        (lambda z, q, v, force: z - 2e3 * force, jnp.float32),
+        (lambda z, q, v, force: z * jnp.exp(q[0]) - q[1] * v[0] * force, jnp.float64),
     ],
     ids=["a share of the force", "the force in another unit", "a nonlinear function of all"],
 )
