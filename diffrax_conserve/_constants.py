@@ -50,6 +50,9 @@ MAX_DENSE_SYSTEM = 512
 # arrays: they compiled up to two seconds faster, and took two to five times as long. With 0
 # nothing is written out.
 MAX_SCALAR_OPERATIONS = 2048
+# In a batch a function with more results than this stays in arrays. The ten integrals of three
+# bodies and their gradients, 200 numbers, compiled twice as long in scalars, and took as long.
+MAX_SCALAR_RESULTS = 64
 # Where most operations are expected to simplify away, as in a derivative of a derivative, the
 # attempt is given up only after this many times `MAX_SCALAR_OPERATIONS`. Each takes about 5 µs.
 SIMPLIFICATION_FACTOR = 8

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
+from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS, MAX_SCALAR_RESULTS
 from diffrax_conserve._fast.jaxprs import jaxprs_inside
 from diffrax_conserve._fast.scalars import components, scalarised, scalarised_result
 
@@ -68,7 +68,7 @@ FORMS = {
     "take of a matrix": (lambda y: jnp.take(jnp.outer(y, y), ORDER, axis=1).sum(0), ""),
     "indices": (lambda y: both(y[ORDER]) + y[np.array([0, 0])] + y[jnp.array([-1, 1])], ""),
     "mask": (lambda y: both(y) + y[np.array([True, False, True])], ""),
-    "dynamic slice": (lambda y: jax.lax.dynamic_slice(y, (1,), (2,)), ""),
+    "dynamic slice": (lambda y: 2 * jax.lax.dynamic_slice(y, (1,), (2,)), ""),
     "dynamic update": (lambda y: both(jax.lax.dynamic_update_slice(y, 2 * y[:2], (1,))), ""),
     "split": (lambda y: both(jnp.concatenate(jnp.split(y, 3)[::-1])), ""),
     "roll": (lambda y: both(y + jnp.roll(y, 1)), ""),
@@ -173,8 +173,11 @@ def test_what_is_too_large_has_an_effect_or_random_numbers_is_not_written_out():
         jax.debug.print("{}", y)
         return y
 
-    assert scalarised(lambda y: y + 1, jnp.ones(MAX_SCALAR_OPERATIONS // 2)) is not None
-    assert scalarised(lambda y: y + y + 1, jnp.ones(MAX_SCALAR_OPERATIONS)) is None
+    assert scalarised(lambda y: y * y + 1, jnp.ones(MAX_SCALAR_RESULTS)) is not None
+    assert scalarised(lambda y: y * y + 1, jnp.ones(MAX_SCALAR_RESULTS + 1)) is None
+    assert scalarised(lambda y: y + 1, jnp.ones(3)) is None
+    assert scalarised(lambda y: jnp.sum(y * y), jnp.ones(MAX_SCALAR_OPERATIONS // 2)) is not None
+    assert scalarised(lambda y: jnp.sum(y * y), jnp.ones(MAX_SCALAR_OPERATIONS)) is None
     assert scalarised(prints, jnp.ones(3)) is None
     assert scalarised(lambda y: y + jr.normal(jr.key(0)), jnp.ones(3)) is None
 

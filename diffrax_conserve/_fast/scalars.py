@@ -34,7 +34,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from .._constants import MAX_SCALAR_OPERATIONS, SIMPLIFICATION_FACTOR
+from .._constants import MAX_SCALAR_OPERATIONS, MAX_SCALAR_RESULTS, SIMPLIFICATION_FACTOR
 from .jaxprs import closed_jaxpr, num_equations, outputs, walk
 
 
@@ -64,10 +64,15 @@ def small(fn: Callable[..., PyTree[Array]], *like: Any) -> Callable[..., PyTree[
 def scalarised(fn: Callable[..., Any], *like: Any) -> Callable[..., Any] | None:
     """`fn` with each array that it takes and returns replaced by the tuple of its elements.
 
-    It is `None` if `fn` is too large, has an effect or uses random keys. A function inside that has
-    a derivative rule of its own is looked into, and its rule is lost.
+    It is `None` if `fn` is too large, has many results, has an effect or uses random keys, or is a
+    single operation, for which nothing is gained. A function inside that has a derivative rule of
+    its own is looked into, and its rule is lost.
     """
-    return written_out(fn, like, lambda *_: MAX_SCALAR_OPERATIONS, arrays=False)
+
+    def limit(size: int, in_arrays: int) -> int:
+        return MAX_SCALAR_OPERATIONS if size <= MAX_SCALAR_RESULTS and in_arrays > 1 else 0
+
+    return written_out(fn, like, limit, arrays=False)
 
 
 def written_out(
