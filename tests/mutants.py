@@ -353,6 +353,12 @@ def take_one_dae_for_another_of_the_same_shapes(package):
         return treedef, tuple(jnp.shape(x) for x in leaves if eqx.is_array_like(x))
 
 
+def give_unknowns_in_many_constraints_large_units(package):
+    @package.around("find_structure")
+    def _(found, *given, **options):
+        return dataclasses.replace(found(*given, **options), shares_free=False)
+
+
 def forget_the_sign_of_a_defect_of_an_invariant(package):
     package.in_module_of(
         "check_invariance", "relative_to_scale", lambda *x: jnp.maximum(relative_to_scale(*x), 0)

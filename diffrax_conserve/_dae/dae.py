@@ -38,7 +38,7 @@ from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .free_unknowns import nearest_with_free
 from .large import SparseMatrix
-from .large_search import NotFound
+from .large_search import MOST_SHARED, NotFound
 from .newton import (
     MAX_NEWTON_STEPS,
     SparseNewton,
@@ -683,6 +683,11 @@ def _consistent(
     movable = jnp.ones(structure.size, bool) if moves is None else jnp.asarray(moves)
     count = sum(len(structure.left(k)) for k in range(structure.index))
     none = jnp.zeros(count, ravel(y).dtype)
+    # In a solve of large equations, where corrections are small, it is enough that the algebraic
+    # unknowns are free.
+    shares_free, large = structure.shares_free, structure.large
+    if large is not None and large.along is not None and count + structure.free.size <= MOST_SHARED:
+        shares_free |= structure.algebraic.size < structure.free.size
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage
@@ -691,7 +696,7 @@ def _consistent(
         vector, moving = ravel(y), moving & movable
         problem = problem_of(manifold, none, t, y, args, cancellation)
         sizes = moving.astype(vector.dtype)
-        if structure.shares_free:
+        if shares_free:
             found = _nearest(dae, structure, problem, vector, sizes, moving, MAX_NEWTON_STEPS)
             return unravel(found.y, y), found.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1])
@@ -701,7 +706,7 @@ def _consistent(
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.
-    stages = structure.search_stages(freely=moves is None and not structure.shares_free)
+    stages = structure.search_stages(freely=moves is None and not shares_free)
     found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
     return found, ok[-1]
 

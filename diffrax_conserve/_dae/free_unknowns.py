@@ -17,6 +17,8 @@ constraints than they can meet: where cells in parallel have one voltage, the di
 constraints are a relation of their charges, and large units would hide it by roundoff.
 """
 
+from typing import Any
+
 import jax.lax as lax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -54,6 +56,8 @@ def nearest_with_free(
 
     jacobian = linearised(candidate)[1].matrix
     directions = lax.stop_gradient(_directions(jacobian, units, along, moves))
+    # What no unknown that moves can correct must hold as it is.
+    uncorrectable = jnp.diag(jnp.all(directions == 0, axis=0).astype(directions.dtype))
 
     def state(multiplier: Float[Array, " m"]) -> Float[Array, " n"]:
         return candidate + directions @ multiplier
@@ -62,19 +66,26 @@ def nearest_with_free(
         return problem.residual(state(multiplier))
 
     def newton(begin: Float[Array, " m"]) -> Solved:
-        def advance(multiplier: Array, tests_left: Array) -> tuple[Array, Array]:
-            y = state(multiplier)
+        """The multipliers, and the state, to which corrections are added: computed from the
+        candidate, a component that vanishes would keep its roundoff."""
+
+        def advance(now: tuple[Array, Array], tests_left: Array) -> tuple[Any, Array]:
+            multiplier, y = now
             g, rows = linearised(y)
             status, to_correct = problem.status(g, problem.scale(rows, y))
             tests_left = remaining_after_test(status, tests_left)
-            change = solve_equilibrated(rows.matrix @ directions, to_correct)
-            return where_active(tests_left, multiplier - change, multiplier), tests_left
+            change = solve_equilibrated(rows.matrix @ directions + uncorrectable, to_correct)
+            moved = multiplier - change, y - directions @ change
+            return where_active(tests_left, moved, now), tests_left
 
-        return iterate(advance, begin, max_steps=max_steps)
+        found = iterate(advance, (begin, state(begin)), max_steps=max_steps)
+        multiplier, y = found.y
+        return found._replace(y=multiplier, aux=y)
 
     none = jnp.zeros(problem.num_residuals, candidate.dtype)
     found = root(residual, newton, none, solve_equilibrated)
-    return found._replace(y=state(found.y))
+    y = state(found.y)
+    return found._replace(y=y + lax.stop_gradient(found.aux - y), aux=None)
 
 
 def _directions(
@@ -94,8 +105,9 @@ def _directions(
     both = jnp.concatenate([scaled, by_free / columns], 1)
     rows = _largest(both, 1)
     scaled, by_free = jnp.split(both / rows, [len(units)], axis=1)
-    fixed = jnp.diag(jnp.broadcast_to(jnp.where(moves, 0, 1), f).astype(units.dtype))
-    matrix = jnp.block([[scaled @ scaled.T, by_free], [by_free.T, fixed]])
+    matrix = jnp.block([[scaled @ scaled.T, by_free], [by_free.T, jnp.zeros((f, f), units.dtype)]])
+    # Empty rows, of what cannot be corrected or does not move, have the solution zero.
+    matrix = matrix + jnp.diag(jnp.all(matrix == 0, axis=1).astype(units.dtype))
     solution = solve_equilibrated(matrix, jnp.eye(m + f, m, dtype=units.dtype))
     change = units[:, None] * (scaled.T @ solution[:m]) + along @ (solution[m:] / columns.T)
     return change / rows.T

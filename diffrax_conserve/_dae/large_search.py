@@ -37,7 +37,7 @@ MAX_INDEX = 3
 _MOST_TERMS = 64
 # If constraints share the unknowns without slopes, a projection solves a dense system; see
 # `free_unknowns`. With more of both than this it would take seconds.
-_MOST_SHARED = 1000
+MOST_SHARED = 1000
 _NOT_CONSTANT = "the coefficients of their slopes are coupled, and not constant"
 # So many equations are solved one after the other for a slope that a constraint needs.
 _LEVELS = 8
@@ -152,15 +152,15 @@ def find_large_structure(
         selected = extended(matrix, selected)
         needed = np.unique(at.columns[~np.isin(left[at.rows], selected[0])])
     large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
-    with_free = gradients[:, structure.free]
-    with_free = with_free[~_empty(with_free, 1)]
-    shares_free = len(extended(with_free, (none, none))[0]) < with_free.shape[0]
+    part = gradients[:, structure.algebraic]
+    part = part[~_empty(part, 1)]
+    shares_free = len(extended(part, (none, none))[0]) < part.shape[0]
     structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
     if structure.index > 1 and shares_free:
         m, f = gradients.shape[0], structure.free.size
-        if m + f > _MOST_SHARED:
+        if m + f > MOST_SHARED:
             raise NotFound(
-                f"{m} constraints share {f} unknowns without slopes, and more than {_MOST_SHARED} "
+                f"{m} constraints share {f} unknowns without slopes, and more than {MOST_SHARED} "
                 "of both would take a dense matrix"
             )
         if large.along is None:

@@ -63,8 +63,8 @@ class Structure:
       before do not, such as positions, velocities and forces; empty if not all constraints can be
       met by these alone.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
-    - `shares_free`: whether the free unknowns are in more constraints than they can meet, so that
-      these constrain other unknowns too, as where cells in parallel have one voltage.
+    - `shares_free`: whether the algebraic unknowns are in more constraints than they can meet, as
+      where cells in parallel have one voltage; in a small system also whether others are free.
     - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
 
@@ -125,29 +125,33 @@ class Structure:
         known = self.rounds[0].slopes if self.rounds else range(self.size)
         return np.setdiff1d(np.arange(self.size), np.array(known, int))
 
+    @property
+    def algebraic(self) -> np.ndarray:
+        """The free unknowns for whose slopes the equations are not solved before the last
+        differentiation either."""
+        known = self.rounds[-1].slopes if self.rounds else range(self.size)
+        return np.setdiff1d(np.arange(self.size), np.array(known, int))
+
     def equilibrated_units(
         self, sizes: Float[Array, " n"], jacobian: AbstractRows
     ) -> Float[Array, " n"]:
-        """The units of a projection in which free unknowns, such as forces, are free: what they can
-        correct moves no other unknown. Those of the others are their sizes.
+        """The units of a projection that moves other unknowns only where algebraic ones, such as
+        forces, do not do. Those of the others are their sizes.
 
-        The sizes of free unknowns may have any ratios, as at a start where some vanish, and a Gram
-        matrix would square these. So their units come from the constraint Jacobian, equilibrated as
-        by LAPACK's `geequ`: first each row is divided by its largest element, then each column. All
-        are so large that they exceed in each row that has some what the other unknowns contribute,
-        by the factor `1/ε`."""
-        others = jacobian.scale_columns(jnp.where(self._is_free, 0, sizes)).largest_in_rows()
-        free = jacobian.scale_columns(jnp.asarray(self._is_free, sizes.dtype))
+        The sizes of algebraic unknowns may have any ratios, as at a start where some vanish, and a
+        Gram matrix would square these. So their units come from the constraint Jacobian,
+        equilibrated as by LAPACK's `geequ`: first each row is divided by its largest element, then
+        each column. All are so large that they exceed in each row that has some what the other
+        unknowns contribute, by the factor `1/ε`."""
+        is_algebraic = np.isin(np.arange(self.size), self.algebraic)
+        others = jacobian.scale_columns(jnp.where(is_algebraic, 0, sizes)).largest_in_rows()
+        free = jacobian.scale_columns(jnp.asarray(is_algebraic, sizes.dtype))
         largest = free.largest_in_rows()
         is_zero, divisor = largest == 0, jnp.where(largest > 0, largest, 1)
         column = free.divide_rows(divisor).largest_in_columns()
         factor = jnp.max(jnp.where(is_zero, 0, others / divisor), initial=0)
         factor = jnp.where(factor > 0, factor, 1) / eps_of(sizes)
-        return jnp.where(self._is_free, factor / jnp.where(column > 0, column, 1), sizes)
-
-    @property
-    def _is_free(self) -> Bool[np.ndarray, " n"]:
-        return np.isin(np.arange(self.size), self.free)
+        return jnp.where(is_algebraic, factor / jnp.where(column > 0, column, 1), sizes)
 
     def search_stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: the constraints of which rounds are
@@ -405,9 +409,10 @@ def find_structure(
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
-    with_free = gradients[:, structure.free]
-    with_free = with_free[with_free.any(1)]
-    shares_free = len(_extended(with_free, _NONE).equations) < len(with_free)
+    part = gradients[:, structure.algebraic]
+    part = part[part.any(1)]
+    shares_free = len(_extended(part, _NONE).equations) < len(part)
+    shares_free |= structure.algebraic.size < structure.free.size
     structure = dataclasses.replace(structure, shares_free=shares_free)
     if all(met):
         found = tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns)
