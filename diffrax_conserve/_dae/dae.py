@@ -263,9 +263,9 @@ class DAE(Hashable):
         - `fixed`: which parts of the state must stay as they are: a PyTree like the state, of which
             each leaf is `True`, `False` or an array of them. By default, with index 1, all that the
             equations differentiate stays, such as $x$ or $M y$. With a higher index the state moves
-            to the nearest point, in the Euclidean distance of what they differentiate. If each differentiation brings unknowns
-            with which its constraints can be met, these alone move for them: of a mechanism first
-            the positions, then the velocities, then the forces.
+            to the nearest point, in the Euclidean distance of what they differentiate. If each
+            differentiation brings unknowns with which its constraints can be met, these alone move
+            for them: of a mechanism first the positions, then the velocities, then the forces.
 
         **Returns:**
 
