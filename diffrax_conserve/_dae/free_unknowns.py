@@ -49,8 +49,10 @@ def nearest_with_free(
     - `moves`: along which of them the state may move.
     """
 
+    problem = problem.with_dense_jacobian()
+
     def linearised(y: Float[Array, " n"]) -> tuple[Float[Array, " m"], DenseRows]:
-        g, rows = problem.with_dense_jacobian().linearise(y)
+        g, rows = problem.linearise(y)
         assert isinstance(rows, DenseRows)
         return g, rows
 
