@@ -356,7 +356,7 @@ def take_one_dae_for_another_of_the_same_shapes(package):
 def give_unknowns_in_many_constraints_large_units(package):
     @package.around("find_structure")
     def _(found, *given, **options):
-        return dataclasses.replace(found(*given, **options), shares_free=False)
+        return dataclasses.replace(found(*given, **options), shares_free=False, by_free=None)
 
 
 def forget_the_sign_of_a_defect_of_an_invariant(package):

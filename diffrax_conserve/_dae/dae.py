@@ -650,7 +650,7 @@ class ConstraintProjection(AbstractProjection):
         if structure.index != 1:
             metric, one = problem.factor, jnp.ones_like(candidate)
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
-            if structure.shares_free:
+            if structure.by_free is not None:
                 found = _nearest(self.dae, structure, problem, candidate, sizes)
                 info = problem.report(candidate, found.y, found.num_iterations, ok=found.ok)
                 return found.y, info
@@ -696,7 +696,7 @@ def _consistent(
         vector, moving = ravel(y), moving & movable
         problem = problem_of(manifold, none, t, y, args, cancellation)
         sizes = moving.astype(vector.dtype)
-        if shares_free:
+        if shares_free or structure.by_free is not None:
             found = _nearest(dae, structure, problem, vector, sizes, moving, MAX_NEWTON_STEPS)
             return unravel(found.y, y), found.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1])
@@ -730,7 +730,8 @@ def _nearest(
     along = lax.stop_gradient(along)
     some = True if moves is None else ~jnp.any((along != 0) & ~moves[:, None], 0)
     units = lax.stop_gradient(sizes).at[free].set(0)
-    return nearest_with_free(problem, candidate, units, along, some, max_steps=max_steps)
+    moving = some if structure.by_free is None else some & structure.by_free
+    return nearest_with_free(problem, candidate, units, along, moving, max_steps=max_steps)
 
 
 @eqx.filter_jit

@@ -36,7 +36,7 @@ def nearest_with_free(
     candidate: Float[Array, " n"],
     units: Float[Array, " n"],
     along: Float[Array, "n f"],
-    moves: Bool[Array, " f"] | bool = True,
+    moves: Bool[Array, "*m f"] | bool = True,
     *,
     max_steps: int,
 ) -> Solved:
@@ -46,7 +46,7 @@ def nearest_with_free(
 
     - `units`: of the unknowns that are not free, zero for all others and for what does not move.
     - `along`: the columns of `N`.
-    - `moves`: along which of them the state may move.
+    - `moves`: along which of them the state may move, or may do so for which constraint.
     """
 
     problem = problem.with_dense_jacobian()
@@ -94,7 +94,7 @@ def _directions(
     jacobian: Float[Array, "m n"],
     units: Float[Array, " n"],
     along: Float[Array, "n f"],
-    moves: Bool[Array, " f"] | bool,
+    moves: Bool[Array, "*m f"] | bool,
 ) -> Float[Array, "n m"]:
     """The changes of the state, one for each constraint, that change its residual alone, by one.
 

@@ -24,7 +24,7 @@ from jaxtyping import Array
 
 from .._fast.run_once import RunOnce
 from .._large.detection import NotSparse, jacobian_places
-from .._large.elimination import TooFull, combinations, extended
+from .._large.elimination import TooFull, combinations, exact_sum, extended
 from .._large.klu import SparseJacobian
 from .large import Elimination, Large, SparseMatrix
 from .reduction import Numbers, Reduction, Round, Singular, Structure, WithNumbers, general_states
@@ -129,8 +129,8 @@ def find_large_structure(
         left = np.array(structure.left(structure.index - 1), int)
         if structure.index == 1:  # the derivatives of equations, or of combinations of them
             share = _combined(structure)
-            at, new = _jacobian(abs(share) @ _ones(by_y)), sp.csr_array(share @ _matrix(by_y, of_y))
-            new.eliminate_zeros()
+            at, of_y = _jacobian(abs(share) @ _ones(by_y)), _matrix(by_y, of_y)
+            new = exact_sum(share @ of_y, abs(share) @ abs(of_y))
         else:
             last = _Last(equations, structure)
             at = once(last, ft.partial(places.of, last.constraints, 1, n))
@@ -165,6 +165,8 @@ def find_large_structure(
             )
         if large.along is None:
             raise NotFound(_NOT_CONSTANT)
+        by_free = (gradients @ large.along.matrix).toarray() != 0
+        structure = dataclasses.replace(structure, by_free=by_free)
     if all(met):
         structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
     return structure

@@ -65,6 +65,9 @@ class Structure:
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     - `shares_free`: whether the algebraic unknowns are in more constraints than they can meet, as
       where cells in parallel have one voltage; in a small system also whether others are free.
+    - `by_free`: which constraints depend on which free unknowns, a row for each constraint, if a
+      projection must know it, because they share these or because roundoff hides it; see
+      `free_unknowns`. Otherwise `None`.
     - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
 
@@ -76,13 +79,15 @@ class Structure:
     new_unknowns: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
     shares_free: bool = False
+    by_free: Bool[np.ndarray, "m f"] | None = None
     large: Large | None = None
 
     def _values(self) -> tuple[Any, ...]:
+        by_free = None if self.by_free is None else self.by_free.tobytes()
         if self.large is not None:  # found once for equations, so it is compared by identity
-            return self.large, self.rounds
-        others = dataclasses.astuple(dataclasses.replace(self, mass=None))
-        return *others, None if self.mass is None else self.mass.tobytes()
+            return self.large, self.rounds, by_free
+        others = dataclasses.astuple(dataclasses.replace(self, mass=None, by_free=None))
+        return *others, by_free, None if self.mass is None else self.mass.tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Structure) and self._values() == other._values()
@@ -219,11 +224,15 @@ class Reduction:
     def slopes(self, k: int) -> Callable[[Array, Array], Array]:
         """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
         are not selected are zero."""
-        structure, equations, constraints = self.structure, self.equations, self.constraints
+        structure = self.structure
         if structure.large is not None:
             return self._needed_slopes(k)
         every = tuple(range(structure.size))
         selected = structure.rounds[k] if k < structure.index else Round(every, every)
+        return self._selected_slopes(selected)
+
+    def _selected_slopes(self, selected: Round) -> Callable[[Array, Array], Array]:
+        structure, equations, constraints = self.structure, self.equations, self.constraints
         rows, columns = (np.array(x, int) for x in selected)
         as_given = not structure.rounds or not set(rows) & set(structure.left(0))
 
@@ -280,12 +289,19 @@ class Reduction:
 
     def index_one_equations(self, t: Array, y: Array, slopes: Array) -> Array:
         """`F_{ν-1}`, the equations after all differentiations but the last."""
-
-        def differentiated(t: Array, y: Array, slopes: Array) -> Array:
-            _, rates = _along(lambda t, y: self.constraints(t, y)[:-1], t, y, slopes)
-            return self._replaced(self.equations(t, y, slopes), rates)
-
+        differentiated = ft.partial(self._differentiated, lambda t, y: self.constraints(t, y)[:-1])
         return self.small(differentiated, t, y, slopes)(t, y, slopes)
+
+    def derivatives(self, selected: Round, t: Array, y: Array) -> tuple[Array, Array]:
+        """The derivatives of `F_ν`, the equations after all differentiations, by the state and by
+        the slopes, at the slopes that are selected."""
+        differentiated = ft.partial(self._differentiated, self.constraints, t)
+        return jax.jacfwd(differentiated, (0, 1))(y, self._selected_slopes(selected)(t, y))
+
+    def _differentiated(self, constraints: Any, t: Array, y: Array, slopes: Array) -> Array:
+        """The equations, with these constraints differentiated."""
+        _, rates = _along(constraints, t, y, slopes)
+        return self._replaced(self.equations(t, y, slopes), rates)
 
     def _replaced(self, values: Array, rates: Sequence[Array]) -> Array:
         """The values of the equations, with those that are left in the first rounds replaced by the
@@ -385,7 +401,8 @@ def find_structure(
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
         other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    selected, gradients = _extended(matrix, _NONE), np.zeros((0, y.size))
+    selected, given = _extended(matrix, _NONE), matrix.copy()
+    gradients = computed = np.zeros((0, y.size))  # without and with roundoff
     both = np.stack([matrix, other])
     rest = np.delete(both, selected.equations, axis=1)
     without = tuple(np.flatnonzero(~both.any((0, 1))).tolist())
@@ -397,11 +414,15 @@ def find_structure(
         before = known.rounds[structure.index :] if known is not None else ()
         if before and len(before[0].slopes) == len(selected.slopes):
             selected = before[0]
+        by_y, by_slope = _derivatives(equations, structure, selected, numbers, t, y)
+        by_slope = np.where(matrix == 0, 0, by_slope)
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
-        new = np.asarray(_last_gradients(equations, structure, numbers, t, y))
+        with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
+        new = _without_roundoff(with_roundoff, terms)
         new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
         met.append(len(_extended(new[:, new_unknowns[-1]], _NONE).equations) == len(new))
+        computed = np.concatenate([computed, with_roundoff])
         gradients = np.concatenate([gradients, new])
         independent = _extended(gradients, _NONE).equations
         if len(independent) < len(gradients):
@@ -409,15 +430,32 @@ def find_structure(
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
+    found = new_unknowns if all(met) else []
+    return _with_unknowns(structure, gradients, computed, given, found)
+
+
+def _with_unknowns(
+    structure: Structure,
+    gradients: Float[np.ndarray, "m n"],
+    computed: Float[np.ndarray, "m n"],
+    by_slope: Float[np.ndarray, "n n"],
+    new_unknowns: list[Bool[np.ndarray, " n"]],
+) -> Structure:
+    """The structure with what is known of its constraints, from their gradients without and with
+    roundoff."""
+    if not structure.rounds:
+        return structure
     part = gradients[:, structure.algebraic]
     part = part[part.any(1)]
     shares_free = len(_extended(part, _NONE).equations) < len(part)
     shares_free |= structure.algebraic.size < structure.free.size
-    structure = dataclasses.replace(structure, shares_free=shares_free)
-    if all(met):
-        found = tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns)
-        structure = dataclasses.replace(structure, new_unknowns=found)
-    return structure
+    by_free, with_roundoff = (_by_free(x, by_slope, structure) != 0 for x in (gradients, computed))
+    return dataclasses.replace(
+        structure,
+        shares_free=shares_free,
+        by_free=by_free if shares_free or np.any(by_free != with_roundoff) else None,
+        new_unknowns=tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns),
+    )
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.
@@ -428,12 +466,60 @@ def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slop
     return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
 
 
-@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
-def _last_gradients(
-    equations: WithNumbers, structure: Structure, numbers: Numbers, t: Array, y: Array
-) -> Array:
-    constraints = Reduction(structure, ft.partial(equations, numbers), t, y).constraints
-    return jax.jacfwd(lambda y: constraints(t, y)[-1])(y)
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1, 2)))
+def _derivatives(
+    equations: WithNumbers,
+    structure: Structure,
+    selected: Round,
+    numbers: Numbers,
+    t: Array,
+    y: Array,
+) -> tuple[Array, Array]:
+    reduction = Reduction(structure, ft.partial(equations, numbers), t, y)
+    return reduction.derivatives(selected, t, y)
+
+
+def _reduced(
+    by_y: Float[np.ndarray, "n n"],
+    by_slope: Float[np.ndarray, "n n"],
+    selected: Round,
+    left: tuple[int, ...],
+) -> tuple[Float[np.ndarray, "m n"], Float[np.ndarray, "m n"]]:
+    """The gradients of what is left of equations whose selected slopes are eliminated, and their
+    terms."""
+    inner, outer = (by_slope[np.ix_(rows, selected.slopes)] for rows in (selected.equations, left))
+    given, solved = (by_y[list(rows)] for rows in (left, selected.equations))
+    share = _combinations(outer, inner)
+    return given - share @ solved, abs(given) + abs(share) @ abs(solved)
+
+
+def _combinations(
+    rows: Float[np.ndarray, "m k"], matrix: Float[np.ndarray, "k k"]
+) -> Float[np.ndarray, "m k"]:
+    """`rows matrix⁻¹`, the combinations of the rows of a regular matrix that `rows` are."""
+    inverse = np.linalg.inv(matrix)
+    inverse = _without_roundoff(inverse, abs(inverse) @ abs(matrix) @ abs(inverse))
+    return _without_roundoff(rows @ inverse, abs(rows) @ abs(inverse))
+
+
+def _without_roundoff(
+    values: Float[np.ndarray, "m n"], terms: Float[np.ndarray, "m n"]
+) -> Float[np.ndarray, "m n"]:
+    """What cancels but for the roundoff of its terms is zero. If it counted, equations would have
+    another structure than combinations of them."""
+    return np.where(abs(values) > eps_of(values) ** REGULARISATION_POWER * terms, values, 0)
+
+
+def _by_free(
+    gradients: Float[np.ndarray, "m n"], by_slope: Float[np.ndarray, "n n"], structure: Structure
+) -> Float[np.ndarray, "m f"]:
+    """The derivatives of the constraints by the free unknowns."""
+    rows, columns = (np.array(x, int) for x in structure.rounds[0])
+    free = structure.free
+    along = np.eye(structure.size)[:, free]
+    inner, outer = by_slope[np.ix_(rows, columns)], by_slope[np.ix_(rows, free)]
+    along[columns] = -_combinations(outer.T, inner.T).T
+    return _without_roundoff(gradients @ along, abs(gradients) @ abs(along))
 
 
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))

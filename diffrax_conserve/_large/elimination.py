@@ -95,10 +95,14 @@ def _remainder(matrix: sp.csr_array, pivots: Pivots, others: Pivots) -> sp.csr_a
     (rows, columns), (below, beside) = pivots, others
     share = combinations(matrix[below][:, columns], matrix[rows][:, columns])
     given, rest = matrix[below][:, beside], matrix[rows][:, beside]
-    left = sp.csr_array(given - share @ rest)
-    # What cancels but for the roundoff of its terms is zero.
-    terms = sp.csr_array(abs(given) + abs(share) @ abs(rest))
-    return _without_roundoff(sp.csr_array(left * (abs(left) > _LEAST * terms)))
+    return _without_roundoff(exact_sum(given - share @ rest, abs(given) + abs(share) @ abs(rest)))
+
+
+def exact_sum(values: Any, terms: Any) -> sp.csr_array:
+    """Sums without those that cancel but for the roundoff of their terms."""
+    out = sp.csr_array(values * (abs(values) > _LEAST * terms))
+    out.eliminate_zeros()
+    return out
 
 
 def combinations(rows: sp.csr_array, matrix: sp.csr_array) -> sp.csr_array:

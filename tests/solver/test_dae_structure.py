@@ -5,6 +5,7 @@ import diffrax as dfx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import diffrax_conserve as dfc
 
@@ -148,3 +149,58 @@ test_mistakes_are_named = refused(
         r"index 1 and 1 degrees of freedom.*index 0 and 2.*dae.at\(",
     ),
 )
+
+
+# ---- Combinations of equations ----
+
+
+def orthogonal(n, seed):
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0]
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_roundoff_of_a_combination_is_no_equation(mixed):
+    """Of index 2: condensers between the nodes 1 and 2, and 1 and 5, a voltage between 5 and 1,
+    resistors from 2 by 4 to 3, and a coil as the only way to the ground. So no current flows in the
+    coil, and the charge of the first condenser is all that is free. The sums of the rows of the
+    condensers, which are zero, are so only to roundoff."""
+    mass, matrix = np.zeros((7, 7)), np.zeros((7, 7))
+    for a, b, capacity in ((0, 1, 0.6), (0, 4, 0.1)):
+        mass[np.ix_([a, b], [a, b])] += capacity * np.array([[1, -1], [-1, 1]])
+    for a, b, conductance in ((1, 3, 0.8), (3, 2, 0.6)):
+        matrix[np.ix_([a, b], [a, b])] -= conductance * np.array([[1, -1], [-1, 1]])
+    matrix[0, 5], matrix[4, 5], matrix[5, 0], matrix[5, 4] = 1, -1, -1, 1
+    mass[6, 6], matrix[0, 6], matrix[6, 0] = 0.5, -1, 1
+    change = orthogonal(7, 0) if mixed else np.eye(7)
+    source = -change[:, 5]
+    dae = dfc.DAE(lambda t, y, a: change @ matrix @ y + source * jnp.cos(t), mass=change @ mass)
+    guess = jnp.array([0.3, 0.6, 1.0, 1.3, 1.6, 0.0, 0.0])
+    found = dae.report(guess)
+    assert (found.index, found.freedom) == (2, 1)
+    y = np.asarray(dae.consistent(guess))
+    np.testing.assert_allclose(y[[0, 4, 6]], [0, 1, 0], rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(y[1:4], y[1], atol=1e-14)
+
+
+def test_a_combination_of_all_equations_changes_nothing():
+    """Of a pendulum of index 3: neither the index, nor the consistent state, nor the solution."""
+    change = jnp.asarray(orthogonal(5, 1))
+
+    def pendulum(t, y, dy, args):
+        (q, v, force), (dq, dv, _) = jnp.split(y, [2, 4]), jnp.split(dy, [2, 4])
+        down = jnp.array([0.0, -9.81])
+        return jnp.concatenate([dq - v, dv + force * q - down, jnp.sum(q**2, keepdims=True) - 1])
+
+    guess = jnp.array([1.0, 0.1, 0.1, 0.2, 0.3])
+    ends = []
+    for residual in (pendulum, lambda *given: change @ pendulum(*given)):
+        dae = dfc.DAE(residual=residual)
+        found = dae.report(guess)
+        assert (found.index, found.freedom) == (3, 2)
+        y0 = dae.consistent(guess)
+        sol = solve(dae, y0, None)
+        assert sol.result == dfx.RESULTS.successful
+        assert jnp.all(jnp.abs(pendulum(0.0, sol.ys[-1], guess, None)[-1]) < 16 * EPS)
+        ends.append((y0, sol.ys[-1]))
+    for a, b, accuracy in zip(*ends, (1e-13, 1e-6), strict=True):
+        np.testing.assert_allclose(a, b, rtol=accuracy, atol=accuracy)
