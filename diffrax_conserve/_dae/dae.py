@@ -67,17 +67,20 @@ def _mass(mass: Any) -> Any:
             "`mass` of a `DAE` is traced by JAX, but its zeros decide how the equations are "
             "solved. Pass a function `mass(t, y, args)`, and what it depends on in `args`."
         )
-    if isinstance(mass, BCOO):
-        at = np.asarray(mass.indices)
-        values = np.asarray(mass.data)
-        mass = sp.coo_array((values, (at[:, 0], at[:, 1])), mass.shape) if at.ndim == 2 else mass
+    if isinstance(mass, BCOO) and mass.n_batch == mass.n_dense == 0:
+        at = tuple(np.asarray(mass.indices).T)
+        mass = sp.coo_array((np.asarray(mass.data), at), mass.shape)
+    elif isinstance(mass, BCOO):
+        mass = mass.todense()
     mass = mass if sp.issparse(mass) else np.asarray(mass)
     values = mass.tocoo().data if sp.issparse(mass) else mass  # pyright: ignore
-    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not np.all(np.isfinite(values)):
+    is_real = values.dtype.kind in "biuf" and np.all(np.isfinite(values))
+    if mass.ndim != 2 or mass.shape[0] != mass.shape[1] or not is_real:
         raise ValueError(
-            f"`mass` of a `DAE` has the shape {mass.shape}, or is not finite. Pass a square "
-            "matrix of numbers, with a row for each equation and a column for each number of the "
-            "state, or a function `mass(t, y, args)` that returns one."
+            f"`mass` of a `DAE` has the shape {mass.shape} and the dtype {values.dtype}, or is not "
+            "finite. Pass a square matrix of real numbers, with a row for each equation and a "
+            "column for each number of the state, two for a complex one, or a function "
+            "`mass(t, y, args)` that returns one."
         )
     return _Matrix(SparseMatrix(sp.csr_array(mass, dtype=float)))
 
@@ -91,11 +94,19 @@ def _product(mass: Any, slopes: Float[Array, " n"]) -> Float[Array, " n"]:
             "trace. Return a `jax.experimental.sparse.BCOO` or a matrix, or pass a constant mass "
             "matrix itself."
         )
+    mass = mass if isinstance(mass, BCOO) else jnp.asarray(mass)
+    if jnp.issubdtype(mass.dtype, jnp.complexfloating) or mass.shape != (slopes.size,) * 2:
+        raise ValueError(
+            f"The function `mass` of a `DAE` returns a matrix of the shape {mass.shape} and the "
+            f"dtype {mass.dtype}. Return one of real numbers, with {slopes.size} rows and columns, "
+            "one for each number of the state, two for a complex one."
+        )
     if isinstance(mass, BCOO) and mass.n_batch == mass.n_dense == 0:
         rows, columns = mass.indices.T
         terms = mass.data.astype(slopes.dtype) * slopes[columns]
         return jnp.zeros(mass.shape[0], slopes.dtype).at[rows].add(terms)
-    return jnp.asarray(mass, slopes.dtype) @ slopes
+    mass = mass.todense() if isinstance(mass, BCOO) else mass
+    return mass.astype(slopes.dtype) @ slopes
 
 
 @final
@@ -606,7 +617,8 @@ def _names(root: str, tree: Any) -> list[str]:
             if leaf.ndim == 0
             else [f"[{', '.join(map(str, i))}]" for i in np.ndindex(leaf.shape)]
         )
-        out += [name + place for place in places] * _parts(leaf)
+        parts = ("",) if _parts(leaf) == 1 else (".real", ".imag")
+        out += [name + place + part for part in parts for place in places]
     return out
 
 

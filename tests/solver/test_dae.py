@@ -291,6 +291,7 @@ def test_a_solve_into_a_singular_state_fails(controller):
 
 X = jnp.ones(2)
 PAIRED = pair(lambda t, x, z, args: (x, x), lambda t, x, z, args: x - z)
+COMPLEX = dfc.DAE(lambda t, y, args: y, mass=lambda t, y, args: 1j * jnp.eye(2))
 SPARE = pair(lambda t, x, z, args: x, lambda t, x, z, args: x - z)
 
 
@@ -302,6 +303,8 @@ test_mistakes_are_named = refused(
     (lambda: CUBIC.consistent(X, jnp.array([1, 1])), TypeError, "floating-point"),
     (lambda: CUBIC.term.vf(0.0, X[0], None), ValueError, r"a pair `\(x, z\)`"),
     (lambda: PAIRED.consistent(X[0], X[0]), ValueError, "`f` returns .* like `x`"),
+    (lambda: dfc.DAE(CUBIC.f, mass=1j * np.eye(2)), ValueError, "dtype complex128"),
+    (lambda: COMPLEX.consistent(X), ValueError, "dtype complex128.* 2 rows"),
     # The pair is taken as its parts.
     (lambda: PAIRED.report((X[0], X[0])), ValueError, "`f` returns .* like `x`"),
 )
