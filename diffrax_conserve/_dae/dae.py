@@ -38,7 +38,7 @@ from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .free_unknowns import nearest_with_free
 from .large import SparseMatrix
-from .large_search import MOST_SHARED, NotFound
+from .large_search import NotFound
 from .newton import (
     MAX_NEWTON_STEPS,
     SparseNewton,
@@ -291,8 +291,8 @@ class DAE(Hashable):
         _checked_structure(self, t, y, args)
         is_traced = _is_traced(self, t, y, args)
         t = jnp.asarray(t, jnp.result_type(float, t))
-        moves = None if fixed is None else ~_flags(fixed, y)
-        found, ok = (_consistent.inside if is_traced else _consistent)(self, t, y, args, moves)
+        flags = None if fixed is None else _flags(fixed, y).tobytes()
+        found, ok = (_consistent.inside if is_traced else _consistent)(self, t, y, args, flags)
         message = (
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
@@ -659,10 +659,13 @@ class ConstraintProjection(AbstractProjection):
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         state = problem.state(candidate)
         structure = _structure(self.dae, problem.t, state, problem.args)
+        if structure.large is not None:
+            # Along a ladder of a thousand resistors the voltages underflow.
+            problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
         if structure.index != 1:
             metric, one = problem.factor, jnp.ones_like(candidate)
             sizes = metric.diagonal if isinstance(metric, Diagonal) else one
-            if structure.by_free is not None:
+            if structure.moves_free:
                 found = _nearest(self.dae, structure, problem, candidate, sizes)
                 info = problem.report(candidate, found.y, found.num_iterations, ok=found.ok)
                 return found.y, info
@@ -671,9 +674,6 @@ class ConstraintProjection(AbstractProjection):
             y, info = SimplifiedNewton().solve(dataclasses.replace(problem, factor=free), candidate)
             length = lax.stop_gradient(metric.norm(y - candidate))
             return y, dataclasses.replace(info, correction=length)
-        if structure.large is not None:
-            # Along a ladder of a thousand resistors the voltages underflow.
-            problem = dataclasses.replace(problem, atol=least_exact(candidate.dtype))
         y, converged = _solved_for(self.dae, problem.t, state, problem.args, error_oriented_newton)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
@@ -683,33 +683,32 @@ class ConstraintProjection(AbstractProjection):
 
 @ft.partial(RunOnce, eqx.filter_jit)
 def _consistent(
-    dae: DAE, t: Array, y: Y, args: Args, moves: Bool[np.ndarray, " n"] | None
+    dae: DAE, t: Array, y: Y, args: Args, flags: bytes | None
 ) -> tuple[Y, Bool[Array, ""]]:
-    """A consistent state near a guess, of which some numbers move, and whether it was found."""
+    """A consistent state near a guess, of which flags may say what is fixed, and whether it was
+    found."""
     structure = _structure(dae, t, y, args)
     if structure.index == 0:
         return y, tree_all_finite(_Slopes(dae)(t, y, args))
-    if moves is None and structure.index == 1:
+    if flags is None and structure.index == 1:
         found = unravel(_solved_for(dae, t, y, args, algebraic_newton)[0], y)
         return found, tree_all_finite(found)
-    movable = jnp.ones(structure.size, bool) if moves is None else jnp.asarray(moves)
-    count = sum(len(structure.left(k)) for k in range(structure.index))
+    fixed = np.zeros(structure.size, bool) if flags is None else np.frombuffer(flags, bool)
+    count, large = sum(len(structure.left(k)) for k in range(structure.index)), structure.large
     none = jnp.zeros(count, ravel(y).dtype)
-    # In a solve of large equations, where corrections are small, it is enough that the algebraic
-    # unknowns are free.
-    shares_free, large = structure.shares_free, structure.large
-    if large is not None and large.along is not None and count + structure.free.size <= MOST_SHARED:
-        shares_free |= structure.algebraic.size < structure.free.size
+    shared = structure.shares_free or structure.determines_free
+    shared &= large is None or large.along is not None
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage
         manifold = {"equations": Constraint(_Constraints(dae, asked))}
         cancellation = cancellation_scale(manifold, t, y, args)[2]
-        vector, moving = ravel(y), moving & movable
-        problem = problem_of(manifold, none, t, y, args, cancellation)
+        vector, moving = ravel(y), moving & ~fixed
+        least = None if large is None else least_exact(vector.dtype)
+        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least)
         sizes = moving.astype(vector.dtype)
-        if shares_free or structure.by_free is not None:
-            found = _nearest(dae, structure, problem, vector, sizes, moving, MAX_NEWTON_STEPS)
+        if shared:  # then all move in all stages
+            found = _nearest(dae, structure, problem, vector, sizes, fixed, MAX_NEWTON_STEPS)
             return unravel(found.y, y), found.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1])
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
@@ -718,7 +717,7 @@ def _consistent(
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.
-    stages = structure.search_stages(freely=moves is None and not shares_free)
+    stages = structure.search_stages(freely=flags is None and not shared)
     found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
     return found, ok[-1]
 
@@ -729,21 +728,16 @@ def _nearest(
     problem: Problem,
     candidate: Float[Array, " n"],
     sizes: Float[Array, " n"],
-    moves: Bool[Array, " n"] | None = None,
+    fixed: Bool[np.ndarray, " n"] | None = None,
     max_steps: int = MAX_STEPS,
 ) -> Solved:
-    """The nearest state on the constraints, with unknowns of these sizes, unless they are free, and
-    of which only some move if that is given."""
+    """The nearest state on the constraints, with unknowns of these sizes, unless they are free."""
     state = problem.state(candidate)
     equations = dae._equations(problem.t, state, problem.args)
     reduction = Reduction(structure, equations, problem.t, candidate)
-    along, free = reduction.mass_null_space(problem.t, candidate)
-    along = along.dense(candidate.dtype) if isinstance(along, SparseMatrix) else along
-    along = lax.stop_gradient(along)
-    some = True if moves is None else ~jnp.any((along != 0) & ~moves[:, None], 0)
-    units = lax.stop_gradient(sizes).at[free].set(0)
-    moving = some if structure.by_free is None else some & structure.by_free
-    return nearest_with_free(problem, candidate, units, along, moving, max_steps=max_steps)
+    basis = reduction.mass_null_space(problem.t, candidate)
+    given = problem, candidate, sizes, *basis, structure.by_free, fixed
+    return nearest_with_free(*given, max_steps=max_steps)
 
 
 @eqx.filter_jit

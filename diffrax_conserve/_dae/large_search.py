@@ -35,9 +35,6 @@ MAX_INDEX = 3
 # A matrix of eliminated slopes with more than this many elements for each row is given up: each
 # constraint would contain so many unknowns.
 _MOST_TERMS = 64
-# If constraints share the unknowns without slopes, a projection solves a dense system; see
-# `free_unknowns`. With more of both than this it would take seconds.
-MOST_SHARED = 1000
 _NOT_CONSTANT = "the coefficients of their slopes are coupled, and not constant"
 # So many equations are solved one after the other for a slope that a constraint needs.
 _LEVELS = 8
@@ -155,18 +152,9 @@ def find_large_structure(
     part = gradients[:, structure.algebraic]
     part = part[~_empty(part, 1)]
     shares_free = len(extended(part, (none, none))[0]) < part.shape[0]
+    if structure.index > 1 and shares_free and large.along is None:
+        raise NotFound(_NOT_CONSTANT)
     structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
-    if structure.index > 1 and shares_free:
-        m, f = gradients.shape[0], structure.free.size
-        if m + f > MOST_SHARED:
-            raise NotFound(
-                f"{m} constraints share {f} unknowns without slopes, and more than {MOST_SHARED} "
-                "of both would take a dense matrix"
-            )
-        if large.along is None:
-            raise NotFound(_NOT_CONSTANT)
-        by_free = (gradients @ large.along.matrix).toarray() != 0
-        structure = dataclasses.replace(structure, by_free=by_free)
     if all(met):
         structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
     return structure

@@ -64,10 +64,10 @@ class Structure:
       met by these alone.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     - `shares_free`: whether the algebraic unknowns are in more constraints than they can meet, as
-      where cells in parallel have one voltage; in a small system also whether others are free.
-    - `by_free`: which constraints depend on which free unknowns, a row for each constraint, if a
-      projection must know it, because they share these or because roundoff hides it; see
-      `free_unknowns`. Otherwise `None`.
+      where cells in parallel have one voltage.
+    - `by_free`: in a small system which constraints depend on which free unknowns, a row for each
+      constraint, if a projection must know it, because they share these or because roundoff hides
+      it; see `free_unknowns`. Otherwise `None`.
     - `large`: what large equations need in addition; `None` where all matrices are dense.
     """
 
@@ -136,6 +136,17 @@ class Structure:
         differentiation either."""
         known = self.rounds[-1].slopes if self.rounds else range(self.size)
         return np.setdiff1d(np.arange(self.size), np.array(known, int))
+
+    @property
+    def determines_free(self) -> bool:
+        """Whether some free unknowns are not algebraic, but follow from constraints."""
+        return self.algebraic.size < self.free.size
+
+    @property
+    def moves_free(self) -> bool:
+        """Whether the projection of a step moves along the directions that the equations do not
+        differentiate, as in `free_unknowns`; otherwise algebraic unknowns have large units."""
+        return self.by_free is not None or (self.large is not None and self.shares_free)
 
     def equilibrated_units(
         self, sizes: Float[Array, " n"], jacobian: AbstractRows
@@ -448,12 +459,13 @@ def _with_unknowns(
     part = gradients[:, structure.algebraic]
     part = part[part.any(1)]
     shares_free = len(_extended(part, _NONE).equations) < len(part)
-    shares_free |= structure.algebraic.size < structure.free.size
     by_free, with_roundoff = (_by_free(x, by_slope, structure) != 0 for x in (gradients, computed))
+    hidden = np.any(by_free != with_roundoff)
+    must_know = shares_free or structure.determines_free or hidden
     return dataclasses.replace(
         structure,
         shares_free=shares_free,
-        by_free=by_free if shares_free or np.any(by_free != with_roundoff) else None,
+        by_free=by_free if must_know else None,
         new_unknowns=tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns),
     )
 

@@ -94,6 +94,11 @@ class AbstractRows(eqx.Module):
     def dtype(self) -> Any:
         return jnp.result_type(*jtu.tree_leaves(self))
 
+    @property
+    def is_large(self) -> bool:
+        """Whether units may differ by any ratio, as along a grid in which voltages decay."""
+        return False
+
     def absolute_matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """`|U| x`."""
         return jtu.tree_map(jnp.abs, self).matvec(x)
@@ -103,9 +108,10 @@ class AbstractRows(eqx.Module):
         its row, or one if all are zero.
 
         The products in a Gram matrix could otherwise overflow or underflow in float32. In float64
-        they do not in usual units, so there the scales are one, which saves time.
+        they do not in usual units, so there the scales of a few constraints are one, which saves
+        time.
         """
-        if self.dtype == jnp.float64:
+        if self.dtype == jnp.float64 and not self.is_large:
             like = jax.eval_shape(self.largest_in_rows)  # with the lanes, if they are the last axis
             return jnp.ones(like.shape, like.dtype), self
         row_scales = self.largest_in_rows()

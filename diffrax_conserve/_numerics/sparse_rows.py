@@ -49,6 +49,10 @@ class SparseRows(AbstractRows):
     def __len__(self) -> int:
         return self.pattern.size
 
+    @property
+    def is_large(self) -> bool:
+        return self.pattern.wide
+
     def scale_columns(self, x: Float[Array, " n"]) -> "SparseRows":
         return SparseRows(self.colours * x[self.pattern.active], self.dense * x, self.pattern)
 

@@ -17,6 +17,7 @@ import diffrax_conserve.testing as dct
 from diffrax_conserve._large import sparse
 from diffrax_conserve._numerics.metric import Diagonal
 from diffrax_conserve._numerics.problem import Problem, problem_of
+from diffrax_conserve._numerics.roundoff import _sampled, cancellation_terms
 
 from ..problems import difference, largest, solve
 from ..thinned import some_of
@@ -97,6 +98,39 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(name: str, dtype: 
     multiple = eps ** (-1 / 4) if name == "lattice" else 4096
     check(a @ a.T, same, multiplier, multiple)
     check(a @ b.T, other, multiplier, multiple)
+
+
+def test_units_of_any_ratio_in_a_wide_matrix():
+    """Along a grid some underflow when they are squared. One point stays in its place."""
+    entry, points = MANIFOLDS["lattice"]
+    y = jr.normal(jr.key(2), (points, 3))
+    count = jax.eval_shape(entry.fn, 0.0, y, None).size
+    problem = problem_of({"many": entry}, jnp.zeros(count), 0.0, y, None)
+    fine = jnp.where(jnp.arange(y.size) >= y.size // 2, 1e-180, 1.0)
+    right = jr.normal(jr.key(3), (count,))
+
+    def change(units: Array) -> Array:
+        one = dataclasses.replace(problem, factor=Diagonal(units))
+        scales, rows = one.gradients(y.reshape(-1)).equilibrated()
+        multiplier = rows.gram(rows).solve(right / scales)
+        return one.factor.to_state(rows.rmatvec(multiplier))
+
+    jacobian = problem.linearise(y.reshape(-1))[1]
+    # Bonds with an end in the coarse half are met by that end alone, so that the result solves.
+    np.testing.assert_allclose(jacobian.matvec(change(fine)), right, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_the_roundoff_of_many_residuals_is_that_of_each_alone(shift: float):
+    """Sampled for all, within a factor of two of the sum of squares by a reverse pass for each."""
+    y = jnp.linspace(0.5, 1.5, 40) + shift
+
+    def fn(y: Array) -> Array:
+        return jnp.cos(y) * 1e3 - 1e3 * jnp.cos(y[::-1]) + jnp.cumsum(y**2) - jnp.roll(y, 1) * y
+
+    each = cancellation_terms(fn, y)[2]
+    ratio = _sampled(fn, y) / each
+    assert jnp.all((ratio > 0.4) & (ratio < 2.5)), ratio
 
 
 @pytest.mark.slow

@@ -248,6 +248,64 @@ def test_numbers_known_by_hand(make, n, index, freedom):
     assert structure.large is not None
 
 
+def test_the_currents_of_a_large_pack():
+    """20 groups in series of 20 cells in parallel, with 820 unknowns: all cells of a group have one
+    voltage, and so one charge, and share the current by their capacities."""
+    groups, number = 20, 20
+    capacity = np.random.default_rng(0).uniform(0.9, 1.1, (groups, number))
+
+    def f(t, x, z, load):
+        return -z[0] / capacity
+
+    def algebraic(t, x, z, load):
+        potential = 3.4 + 0.6 * x + 0.1 * jnp.log(x / (1 - x))
+        return potential - z[1][:, None], jnp.sum(z[0], axis=1) - load
+
+    dae = dfc.DAE(f, algebraic=algebraic)
+    guess = jnp.full((groups, number), 0.8), (jnp.ones((groups, number)), jnp.full(groups, 3.9))
+    report = dae.report(*guess, args=40.0)
+    assert (report.index, report.freedom) == (2, groups)
+    x, (currents, _) = dae.consistent(*guess, args=40.0)
+    share = capacity / np.sum(capacity, axis=1, keepdims=True)
+    np.testing.assert_allclose(x, 0.8, rtol=1e-14)
+    np.testing.assert_allclose(currents, 40 * share, rtol=1e-12)
+
+
+@pytest.mark.parametrize("push", [0.0, 9.81])
+def test_forces_that_vanish_or_are_unknown(push):
+    """A net of rods with 946 unknowns and closed loops. In free fall no rod has a force, and the
+    accelerations cancel to roundoff; where one corner is pushed they have one."""
+    side = 11
+    at = np.arange(side**2).reshape(side, side)
+    a = np.r_[at[:, :-1].ravel(), at[:-1].ravel()]
+    b = np.r_[at[:, 1:].ravel(), at[1:].ravel()]
+    place = np.stack([*np.divmod(np.arange(side**2), side), np.zeros(side**2)], -1)
+    place[:, 2] = 0.3 * np.sin(place[:, 0] + 0.7 * place[:, 1])
+    mass = np.random.default_rng(0).uniform(0.5, 1.5, (side**2, 1))
+    outer = -9.81 * mass * np.array([0, 0, 1])
+    outer[0] += push
+
+    def residual(t, y, dy, args):
+        (q, v, force), (dq, dv, _) = y, dy
+        rod = q[a] - q[b]
+        pull = force[:, None] * rod
+        inner = jnp.zeros_like(q).at[a].add(pull).at[b].add(-pull)
+        lengths = np.sum((place[a] - place[b]) ** 2, axis=1)
+        return dq - v, dv - (outer + inner) / mass, jnp.sum(rod**2, axis=1) - lengths
+
+    dae = dfc.DAE(residual=residual)
+    q, v, force = dae.consistent((jnp.asarray(place), jnp.zeros((side**2, 3)), jnp.zeros(len(a))))
+    rod, rows = place[a] - place[b], np.arange(len(a))
+    matrix = np.zeros((len(a), side**2, 3))
+    matrix[rows, a], matrix[rows, b] = rod, -rod
+    weighted = (matrix / mass).reshape(len(a), -1)
+    matrix = matrix.reshape(len(a), -1)
+    exact = np.linalg.solve(weighted @ matrix.T, -matrix @ (outer / mass).ravel())
+    np.testing.assert_allclose(q, place, atol=1e-14)
+    np.testing.assert_allclose(v, 0, atol=1e-14)
+    np.testing.assert_allclose(force, exact, atol=1e-12)
+
+
 def test_what_is_not_found_is_refused_at_once():
     """A dense derivative of an unknown operation, and an index of 4."""
     n = 400
