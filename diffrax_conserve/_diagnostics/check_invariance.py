@@ -119,8 +119,9 @@ def check_invariance(
     $$\frac{|\partial_t I + \sum_i f_i \partial_i I|}{|\partial_t I| + \sum_i |f_i \partial_i I|},$$
 
     which is a few units of roundoff if $I$ is a first integral, and of order one at almost every
-    state if it is not: a misprint in either $I$ or $f$ is found without a solver. A `rate` is
-    subtracted from the derivative, and its size is added to the denominator.
+    state if it is not: a misprint in either $I$ or $f$ is found without a solver, if the terms that
+    it changes are not below `rtol` of the others, as those of a light body beside a heavy one. A
+    `rate` is subtracted from the derivative, and its size is added to the denominator.
 
     **Arguments:**
 

@@ -243,7 +243,10 @@ def step_norm(
     Each component counts as moved by at least `√ε` of itself. Where gradients are nearly parallel,
     the roundoff of the residuals alone moves a state by about that much. Without this floor a step
     at rest would have no length, and every correction would be longer than it.
+
+    A length has no derivative: that of a norm whose squares underflow is NaN.
     """
+    changes, end, factor = tree_stop_gradient((changes, end, factor))
     floor = eps_of(end) ** 0.5 * jnp.abs(end)
     return factor.norm(jnp.maximum(changes, floor))
 

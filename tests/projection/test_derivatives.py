@@ -1,5 +1,6 @@
 """Derivatives of a projection, against finite differences."""
 
+import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -106,6 +107,22 @@ def test_a_lane_that_failed_spoils_no_other(projection):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-20, 1e-30])
+def test_squares_that_underflow_leave_the_derivative_as_it_is(size):
+    """At a saved time, in reverse mode: of an oscillator in single precision, whose energy is zero
+    as a number."""
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), dfc.FirstIntegral(lambda t, y, a: jnp.sum(y**2)))
+    term = dfx.ODETerm(lambda t, y, args: jnp.stack([y[1], -y[0]]))
+    start, end, step, time = (jnp.asarray(x, jnp.float32) for x in (0, 0.2, 0.1, 0.15))
+
+    def position(y):
+        saved = dfx.SaveAt(ts=time[None])
+        return dfx.diffeqsolve(term, solver, start, end, step, y, saveat=saved).ys[0, 0]
+
+    found = jax.jit(jax.grad(position))(jnp.array([size, 0], jnp.float32))
+    np.testing.assert_allclose(found, [np.cos(0.15), np.sin(0.15)], rtol=1e-5)
+
+
 def test_derivatives_are_linear_or_nan():
     """Linear in the tangent, also in a very small one; where the constraint has an infinite
     derivative, NaN in both modes."""
