@@ -64,15 +64,15 @@ def nearest_with_free(
     fixed = np.zeros(candidate.size, bool) if fixed is None else fixed
     units = jnp.where(fixed, 0, units.at[free].set(0))
     problem_at, at, units = tree_stop_gradient((problem, candidate, units))
-    corrections: Any = None
+    found = None
     if isinstance(along, SparseMatrix):
         along = SparseMatrix(along.matrix[:, ~(abs(along.matrix.T) @ fixed).astype(bool)])
         found = sparse_jacobian(problem.residual, candidate)
-        if found is not None:
-            places = _Places(found, along, free, fixed)
-            corrections = _SparseCorrections.at(problem_at, at, units, places)
-        along = along.dense(candidate.dtype)
-    if corrections is None:
+    if isinstance(along, SparseMatrix) and found is not None:
+        places = _Places(found, along, free, fixed)
+        corrections: Any = _SparseCorrections.at(problem_at, at, units, places)
+    else:
+        along = along.dense(candidate.dtype) if isinstance(along, SparseMatrix) else along
         moves = ~jnp.any((along != 0) & fixed[:, None], 0)
         moves = moves if by_free is None else moves & by_free
         corrections = _DenseCorrections.at(problem_at, at, units, moves, along)
