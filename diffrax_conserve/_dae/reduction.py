@@ -430,7 +430,7 @@ def find_structure(
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
-        new = _without_roundoff(with_roundoff, terms)
+        new = _unless_roundoff(with_roundoff, terms)
         new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
         met.append(len(_extended(new[:, new_unknowns[-1]], _NONE).equations) == len(new))
         computed = np.concatenate([computed, with_roundoff])
@@ -510,11 +510,11 @@ def _combinations(
 ) -> Float[np.ndarray, "m k"]:
     """`rows matrix⁻¹`, the combinations of the rows of a regular matrix that `rows` are."""
     inverse = np.linalg.inv(matrix)
-    inverse = _without_roundoff(inverse, abs(inverse) @ abs(matrix) @ abs(inverse))
-    return _without_roundoff(rows @ inverse, abs(rows) @ abs(inverse))
+    inverse = _unless_roundoff(inverse, abs(inverse) @ abs(matrix) @ abs(inverse))
+    return _unless_roundoff(rows @ inverse, abs(rows) @ abs(inverse))
 
 
-def _without_roundoff(
+def _unless_roundoff(
     values: Float[np.ndarray, "m n"], terms: Float[np.ndarray, "m n"]
 ) -> Float[np.ndarray, "m n"]:
     """What cancels but for the roundoff of its terms is zero. If it counted, equations would have
@@ -531,7 +531,7 @@ def _by_free(
     along = np.eye(structure.size)[:, free]
     inner, outer = by_slope[np.ix_(rows, columns)], by_slope[np.ix_(rows, free)]
     along[columns] = -_combinations(outer.T, inner.T).T
-    return _without_roundoff(gradients @ along, abs(gradients) @ abs(along))
+    return _unless_roundoff(gradients @ along, abs(gradients) @ abs(along))
 
 
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))
