@@ -459,7 +459,10 @@ def _with_unknowns(
     part = gradients[:, structure.algebraic]
     part = part[part.any(1)]
     shares_free = len(_extended(part, _NONE).equations) < len(part)
-    by_free, with_roundoff = (_by_free(x, by_slope, structure) != 0 for x in (gradients, computed))
+    along = _null_space(by_slope, structure)
+    by_free, with_roundoff = (
+        _unless_roundoff(x @ along, abs(x) @ abs(along)) != 0 for x in (gradients, computed)
+    )
     hidden = np.any(by_free != with_roundoff)
     must_know = shares_free or structure.determines_free or hidden
     return dataclasses.replace(
@@ -522,16 +525,16 @@ def _unless_roundoff(
     return np.where(abs(values) > eps_of(values) ** REGULARISATION_POWER * terms, values, 0)
 
 
-def _by_free(
-    gradients: Float[np.ndarray, "m n"], by_slope: Float[np.ndarray, "n n"], structure: Structure
-) -> Float[np.ndarray, "m f"]:
-    """The derivatives of the constraints by the free unknowns."""
+def _null_space(
+    by_slope: Float[np.ndarray, "n n"], structure: Structure
+) -> Float[np.ndarray, "n f"]:
+    """As `Reduction.mass_null_space`, of numbers."""
     rows, columns = (np.array(x, int) for x in structure.rounds[0])
     free = structure.free
     along = np.eye(structure.size)[:, free]
     inner, outer = by_slope[np.ix_(rows, columns)], by_slope[np.ix_(rows, free)]
     along[columns] = -_combinations(outer.T, inner.T).T
-    return _unless_roundoff(gradients @ along, abs(gradients) @ abs(along))
+    return along
 
 
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))

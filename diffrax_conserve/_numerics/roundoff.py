@@ -132,7 +132,8 @@ def _sampled(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> Float[Array
 
         def with_error(x: Array, size: Array) -> Array:
             places = np.arange(1, x.size + 1, dtype=float).reshape(x.shape) ** 2 + next(count) ** 2
-            weight = 2**0.5 * jnp.sin(frequency * jnp.asarray(places, y.dtype) + phase)
+            angle = jnp.asarray(np.mod(places, 2 * np.pi), y.dtype)  # float32 would lose the phase
+            weight = 2**0.5 * jnp.sin(frequency * angle + phase)
             unit = share * eps_of(x) / eps_of(y)
             return x + (unit * weight * size).astype(x.dtype)
 
@@ -141,6 +142,7 @@ def _sampled(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> Float[Array
     frequencies, phases = jnp.array([1, 1, 2**0.5, 2**0.5]), jnp.array([0, 1, 0, 1]) * np.pi / 2
     changes = jax.vmap(moved)(frequencies.astype(y.dtype), phases.astype(y.dtype)) - fn(y)
     found = jnp.sqrt(jnp.mean((changes / share) ** 2, axis=0))
+    # As in `_adjoint`, what is not finite says nothing of roundoff.
     return jnp.where(found < jnp.inf, found, 0)
 
 
