@@ -424,7 +424,7 @@ def _near(
     numbers: Numbers,
     t: Array,
     y: Array,
-    share: float,
+    share: float | Array,
 ) -> tuple[Array, ...]:
     later, moved, slopes = general_states(t, y, share)
     fn = ft.partial(equations, numbers)

@@ -390,7 +390,7 @@ class Singular(ValueError):
 
 
 # The equations as a function of the numbers in them, and of what an `Implicit` takes.
-Numbers = list[Array]
+Numbers = list[Array | np.ndarray | np.generic]
 WithNumbers = Callable[[Numbers, Array, Array, Array], Array]
 
 
@@ -539,7 +539,7 @@ def _null_space(
 
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=0))
 def _near(
-    equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float
+    equations: WithNumbers, numbers: Numbers, t: Array, y: Array, share: float | Array
 ) -> tuple[Array, ...]:
     """A time and a state at this relative distance, and what is known of the equations there."""
     given = small(ft.partial(equations, numbers), t, y, y)
@@ -552,7 +552,7 @@ def _near(
     return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
 
 
-def general_states(t: Array, y: Array, share: float) -> tuple[Array, Array, Array]:
+def general_states(t: Array, y: Array, share: float | Array) -> tuple[Array, Array, Array]:
     """A time and a state at this relative distance, and two slopes."""
     pattern = irregular_weights(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
