@@ -37,7 +37,7 @@ from .._numerics.lanes import where_active
 from .._numerics.problem import Problem
 from .._numerics.rows import DenseRows
 from .._tree import tree_stop_gradient
-from .large import SparseMatrix
+from .elimination import SparseMatrix
 from .newton import solve_equilibrated
 
 

@@ -23,11 +23,13 @@ import scipy.sparse as sp
 from jaxtyping import Array
 
 from .._fast.run_once import RunOnce
-from .._large.detection import NotSparse, jacobian_places
+from .._large.detection import NotSparse
 from .._large.elimination import TooFull, combinations, exact_sum, extended
 from .._large.klu import SparseJacobian
-from .large import Elimination, Large, SparseMatrix
-from .reduction import Numbers, Reduction, Round, Singular, Structure, WithNumbers, general_states
+from .elimination import Elimination, Round, SparseMatrix
+from .large import Large
+from .places import FindPlaces, Numbers
+from .reduction import LastConstraints, Singular, Structure, WithNumbers, general_states
 
 # The largest index that is looked for. Each differentiation makes the functions larger, and
 # mechanisms have three.
@@ -80,11 +82,11 @@ def find_large_structure(
         return memory[key]
 
     def found() -> Large:
-        given = places.of(equations, 2, n) if mass is None else _jacobian(mass)
-        return Large(places.of(equations, 1, n), given)
+        given = places.of(equations, 2) if mass is None else _jacobian(mass)
+        return Large(places.of(equations, 1), given)
 
     n = y.size
-    places = _Places(numbers, unknown)
+    places = FindPlaces(numbers, unknown, t, y)
     large = once("places", found)
     by_y, by_slope = large.by_y, large.by_slope
     t, y, of_y, values, is_linear, absent = _general_position(
@@ -121,17 +123,22 @@ def find_large_structure(
             _pattern(matrix),
         )
         further = ft.partial(_with_round, structure, selected, matrix, needed)
-        large = once((structure, one, *kind), further)
-        structure = dataclasses.replace(structure, rounds=(*structure.rounds, one), large=large)
+        large, found = once((structure, one, *kind), further)
+        structure = dataclasses.replace(
+            structure,
+            rounds=(*structure.rounds, one),
+            eliminations=(*structure.eliminations, found),
+            large=large,
+        )
         left = np.array(structure.left(structure.index - 1), int)
         if structure.index == 1:  # the derivatives of equations, or of combinations of them
             share = _combined(structure)
             at, of_y = _jacobian(abs(share) @ _ones(by_y)), _matrix(by_y, of_y)
             new = exact_sum(share @ of_y, abs(share) @ abs(of_y))
         else:
-            last = _Last(equations, structure)
-            at = once(last, ft.partial(places.of, last.constraints, 1, n))
-            new = _matrix(at, last.values(at, numbers, t, y))
+            last = LastConstraints(equations, structure)
+            at = once(last, ft.partial(places.of, last, 1))
+            new = _matrix(at, _last_values(last, at, numbers, t, y))
         contained = ~_empty(new, 0)
         new_unknowns.append(np.flatnonzero(contained & ~seen))
         met.append(len(extended(new[:, new_unknowns[-1]], (none, none))[0]) == len(left))
@@ -216,7 +223,7 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 
 def _with_round(
     structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
-) -> Large:
+) -> tuple[Large, Elimination | None]:
     """What one more round needs. It differentiates some of the constraints before it, and needs the
     slopes of the unknowns in these."""
     rows, columns = selected
@@ -233,7 +240,7 @@ def _with_round(
     if k == 0:
         large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
         if structure.is_semi_explicit:
-            return large
+            return large, None
         if not constant:
             raise NotFound(
                 "equations without slopes are combinations of others, and the coefficients of "
@@ -243,14 +250,16 @@ def _with_round(
         share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
         whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
         whole = whole - _spread(share, None, rows, structure.size)
-        return dataclasses.replace(large, combinations=SparseMatrix(whole))
+        return dataclasses.replace(large, combinations=SparseMatrix(whole)), None
     closed = rows[:0], columns[:0]
     if constant:
         closed = _closed(structure.mass, given, columns)
     needed = np.intersect1d(needed, columns)
     levels, needed = _levels(matrix, rows, columns, needed, closed[1])
-    one = Elimination(_inverse(structure.mass, closed, needed), levels)
-    return dataclasses.replace(large, eliminations=(*large.eliminations, one))
+    if levels and not structure.is_linear:
+        raise NotFound("they are not linear in the slopes that a constraint needs")
+    inverse = _inverse(structure.mass, closed, needed)
+    return large, Elimination(inverse, levels, as_given=not levels)
 
 
 def _closed(
@@ -331,7 +340,7 @@ def _levels(
     columns: np.ndarray,
     needed: np.ndarray,
     given: np.ndarray,
-) -> tuple[tuple[tuple[np.ndarray, np.ndarray], ...], np.ndarray]:
+) -> tuple[tuple[Round, ...], np.ndarray]:
     """Equations that are solved one after the other, each for one slope that is needed, if some are
     given; and which of those are needed."""
     at = sp.coo_array(matrix[rows][:, columns])
@@ -352,7 +361,7 @@ def _levels(
     for row, column in reversed(levels):
         some = wanted[column]
         if some.any():
-            kept.append((row[some], column[some]))
+            kept.append(Round(_tuple(row[some]), _tuple(column[some])))
         wanted[j[np.isin(i, row[some])]] = True
     return tuple(reversed(kept)), np.intersect1d(np.flatnonzero(wanted), given)
 
@@ -360,48 +369,11 @@ def _levels(
 # ---- Numbers ----
 
 
-class _Places:
-    """Finds where derivatives have elements, whatever the unknown numbers are."""
-
-    def __init__(self, numbers: Numbers, unknown: tuple[int, ...]):
-        self.numbers, self.unknown = numbers, unknown
-
-    def of(self, fn: Any, argument: int, n: int) -> SparseJacobian:
-        """Of `fn(numbers, t, y, slopes)` by `y` or by `slopes`."""
-
-        def of_one(x: Array, t: Array, other: Array, *others: Array) -> Array:
-            numbers = [*self.numbers]
-            for i, value in zip(self.unknown, others, strict=True):
-                numbers[i] = value
-            pair = (x, other) if argument == 1 else (other, x)
-            return fn(numbers, t, *pair)
-
-        zeros, others = np.zeros(n), [np.asarray(self.numbers[i]) for i in self.unknown]
-        closed = jax.make_jaxpr(of_one)(zeros, np.zeros(()), zeros, *others)
-        return SparseJacobian(*jacobian_places(closed), (closed.out_avals[0].shape[0], n))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Last:
-    """The constraints of the last round."""
-
-    equations: WithNumbers
-    structure: Structure
-
-    def constraints(self, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
-        del slopes
-        reduction = Reduction(self.structure, ft.partial(self.equations, numbers), t, y)
-        return reduction.constraints(t, y)[-1]
-
-    def values(self, places: SparseJacobian, numbers: Numbers, t: Array, y: Array) -> Array:
-        return _last_values(self, places, numbers, t, y)
-
-
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
 def _last_values(
-    last: _Last, places: SparseJacobian, numbers: Numbers, t: Array, y: Array
+    last: LastConstraints, places: SparseJacobian, numbers: Numbers, t: Array, y: Array
 ) -> Array:
-    return places.values(lambda y: last.constraints(numbers, t, y, y), y)
+    return places.values(lambda y: last(numbers, t, y, y), y)
 
 
 @ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))

@@ -16,7 +16,7 @@ is found from numbers at a single state in general position.
 import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.lax as lax
@@ -32,21 +32,13 @@ from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._numerics.rows import AbstractRows
 from .._tree import eps_of, irregular_weights
+from .elimination import NO_ROUND, Elimination, Round, elimination
 from .large import Large
-from .newton import SparseNewton, algebraic_newton, solve_equilibrated
+from .newton import SparseNewton, algebraic_newton
+from .places import FindPlaces, Numbers
 
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
-
-
-class Round(NamedTuple):
-    """The equations that are solved, and the slopes for which they are solved."""
-
-    equations: tuple[int, ...]
-    slopes: tuple[int, ...]
-
-
-_NONE = Round((), ())  # nothing is solved yet
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,6 +47,8 @@ class Structure:
 
     - `size`: the number of equations and of unknowns.
     - `rounds`: for each differentiation, what is solved for what before it.
+    - `eliminations`: for each differentiation, how the slopes follow that its constraints need;
+      `None` where they need none. In a small system one more, for all slopes at the end.
     - `is_linear`: whether the equations are linear in the slopes.
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
@@ -80,14 +74,16 @@ class Structure:
     without_slopes: tuple[int, ...] = ()
     shares_free: bool = False
     by_free: Bool[np.ndarray, "m f"] | None = None
+    eliminations: tuple[Elimination | None, ...] = ()
     large: Large | None = None
 
     def _values(self) -> tuple[Any, ...]:
         by_free = None if self.by_free is None else self.by_free.tobytes()
         if self.large is not None:  # found once for equations, so it is compared by identity
             return self.large, self.rounds, by_free
-        others = dataclasses.astuple(dataclasses.replace(self, mass=None, by_free=None))
-        return *others, by_free, None if self.mass is None else self.mass.tobytes()
+        rest = dataclasses.replace(self, mass=None, by_free=None, eliminations=())
+        mass = None if self.mass is None else self.mass.tobytes()
+        return *dataclasses.astuple(rest), self.eliminations, by_free, mass
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Structure) and self._values() == other._values()
@@ -220,8 +216,7 @@ class Reduction:
         if k == 0 and large is not None and large.combinations is not None:
             combinations = large.combinations
             return lambda t, y: [combinations @ equations(t, y, jnp.zeros_like(y))]
-        none = k == 0 and structure.is_semi_explicit  # such equations contain no slopes
-        slopes = (lambda t, y: jnp.zeros_like(y)) if none else self.slopes(k)
+        slopes = self.slopes(k)
         if k == 0:
             return lambda t, y: [equations(t, y, slopes(t, y))[left]]
         those = np.searchsorted(structure.left(k - 1), left)
@@ -233,81 +228,44 @@ class Reduction:
         return further
 
     def slopes(self, k: int) -> Callable[[Array, Array], Array]:
-        """The slopes that are selected in round `k`, or after the last one all of them. Slopes that
-        are not selected are zero."""
-        structure = self.structure
-        if structure.large is not None:
-            return self._needed_slopes(k)
-        every = tuple(range(structure.size))
-        selected = structure.rounds[k] if k < structure.index else Round(every, every)
-        return self._selected_slopes(selected)
-
-    def _selected_slopes(self, selected: Round) -> Callable[[Array, Array], Array]:
+        """The slopes that the constraints of round `k` need, or after the last one all of them.
+        Others are zero."""
         structure, equations, constraints = self.structure, self.equations, self.constraints
-        rows, columns = (np.array(x, int) for x in selected)
-        as_given = not structure.rounds or not set(rows) & set(structure.left(0))
-
-        def slopes(t: Array, y: Array) -> Array:
-            if not rows.size:
-                return jnp.zeros_like(y)
-            begin, by_t, by_y = jnp.zeros(columns.size, y.dtype), [], []
-            if not as_given:  # once, for all slopes that are tried
-                by_t, by_y = zip(*jax.jacfwd(constraints, (0, 1))(t, y), strict=True)
-
-            def residual(slopes: Array) -> Array:
-                slopes = jnp.zeros_like(y).at[columns].set(slopes)
-                rates = [part + matrix @ slopes for part, matrix in zip(by_t, by_y, strict=True)]
-                return self._replaced(equations(t, y, slopes), rates)[rows]
-
-            if as_given and structure.mass is not None:
-                inverse = np.linalg.inv(structure.mass[np.ix_(rows, columns)])
-                found = -jnp.asarray(inverse, y.dtype) @ residual(begin)
-            elif structure.is_linear:
-                both = jax.jacfwd(lambda slopes: 2 * (residual(slopes),), has_aux=True)
-                matrix, value = both(begin)
-                found = solve_equilibrated(matrix, -value)
-            else:
-                found = root(
-                    residual, ft.partial(algebraic_newton, residual), begin, solve_equilibrated
-                ).y
-            return jnp.zeros_like(y).at[columns].set(found)
-
-        return self.small(slopes, *self.like)
-
-    def _needed_slopes(self, k: int) -> Callable[[Array, Array], Array]:
-        """Those slopes of round `k` that its constraints need; after the last one all."""
-        structure, large = self.structure, self.structure.large
-        equations, constraints = self.equations, self.constraints
-        assert large is not None
-        elimination = large.eliminations[k - 1] if k < structure.index else None
-        as_given = elimination is not None and not elimination.levels
+        is_last = structure.large is not None and k == structure.index
+        found = None if is_last else structure.eliminations[k]
+        if found is None and not is_last:  # the equations that are left contain no slopes
+            return lambda t, y: jnp.zeros_like(y)
+        as_given = found is not None and found.as_given
 
         def slopes(t: Array, y: Array) -> Array:
             def residual(slopes: Array) -> Array:
-                rates = [] if as_given else _along(constraints, t, y, slopes)[1]
+                rates = [] if as_given else _along(constraints, t, y, slopes)[1][:k]
                 return self._replaced(equations(t, y, slopes), rates)
 
-            if elimination is not None:
-                return elimination.slopes(residual, y)
-            assert large.for_slopes is not None
-            begin, newton = jnp.zeros_like(y), SparseNewton(large.for_slopes)
-            if structure.is_linear:
-                return newton.solve(newton.jacobian(residual)(begin), -residual(begin))
-            iterate = ft.partial(algebraic_newton, residual, sparse=newton)
-            return root(residual, iterate, begin, newton.solve, newton.jacobian).y
+            return self._sparsely(residual, y) if found is None else found.slopes(residual, y)
 
-        return slopes
+        return slopes if structure.large is not None else self.small(slopes, *self.like)
+
+    def _sparsely(self, residual: Callable[[Array], Array], like: Array) -> Array:
+        """The root of the equations of a large system by all slopes."""
+        assert self.structure.large is not None
+        assert self.structure.large.for_slopes is not None
+        begin, newton = jnp.zeros_like(like), SparseNewton(self.structure.large.for_slopes)
+        if self.structure.is_linear:
+            return newton.solve(newton.jacobian(residual)(begin), -residual(begin))
+        iterate = ft.partial(algebraic_newton, residual, sparse=newton)
+        return root(residual, iterate, begin, newton.solve, newton.jacobian).y
 
     def index_one_equations(self, t: Array, y: Array, slopes: Array) -> Array:
         """`F_{ν-1}`, the equations after all differentiations but the last."""
         differentiated = ft.partial(self._differentiated, lambda t, y: self.constraints(t, y)[:-1])
         return self.small(differentiated, t, y, slopes)(t, y, slopes)
 
-    def derivatives(self, selected: Round, t: Array, y: Array) -> tuple[Array, Array]:
-        """The derivatives of `F_ν`, the equations after all differentiations, by the state and by
-        the slopes, at the slopes that are selected."""
-        differentiated = ft.partial(self._differentiated, self.constraints, t)
-        return jax.jacfwd(differentiated, (0, 1))(y, self._selected_slopes(selected)(t, y))
+    def derivatives(self, t: Array, y: Array) -> tuple[Array, Array]:
+        """The derivatives of `F_{ν-1}` by the state and by the slopes, at the slopes that the last
+        constraints need."""
+        differentiated = ft.partial(self.index_one_equations, t)
+        return jax.jacfwd(differentiated, (0, 1))(y, self.slopes(self.structure.index - 1)(t, y))
 
     def _differentiated(self, constraints: Any, t: Array, y: Array, slopes: Array) -> Array:
         """The equations, with these constraints differentiated."""
@@ -337,7 +295,11 @@ class Reduction:
         return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
 
     def _by_slopes(self, t: Array, y: Array) -> Float[Array, "n n"]:
-        return jax.jacfwd(self.equations, 2)(t, y, self.slopes(0)(t, y))
+        slopes = jnp.zeros_like(y)
+        if not self.structure.is_linear:
+            together = Elimination(coupled=self.structure.rounds[0], is_linear=False)
+            slopes = together.slopes(ft.partial(self.equations, t, y), y)
+        return jax.jacfwd(self.equations, 2)(t, y, slopes)
 
     def fits(self, t: Array, y: Array) -> Bool[Array, ""]:
         """Whether the equations that are left contain no slopes with the numbers at hand, which may
@@ -390,7 +352,6 @@ class Singular(ValueError):
 
 
 # The equations as a function of the numbers in them, and of what an `Implicit` takes.
-Numbers = list[Array | np.ndarray | np.generic]
 WithNumbers = Callable[[Numbers, Array, Array, Array], Array]
 
 
@@ -401,18 +362,20 @@ def find_structure(
     t: Array,
     y: Array,
     mass: np.ndarray | None,
+    unknown: tuple[int, ...],
     known: Structure | None = None,
 ) -> Structure:
     """The structure of equations with these numbers near a state, by elimination. Whether `∂F/∂y'`
-    is constant, the other numbers tell. While the ranks are those of a known structure, what that
-    selects is taken, for which the programs are compiled."""
+    is constant, the other numbers tell. `unknown` are the numbers that may have any values. While
+    the ranks are those of a known structure, what that selects is taken, for which the programs are
+    compiled."""
     t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
         other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    selected, given = _extended(matrix, _NONE), matrix.copy()
+    selected, given = _extended(matrix, NO_ROUND), matrix.copy()
     gradients = computed = np.zeros((0, y.size))  # without and with roundoff
     both = np.stack([matrix, other])
     rest = np.delete(both, selected.equations, axis=1)
@@ -420,29 +383,70 @@ def find_structure(
     structure = Structure(
         y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
     )
+    find = FindPlaces(numbers, unknown, t, y)
+    places = find.matrix(equations, 2, y.size)
     new_unknowns, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         before = known.rounds[structure.index :] if known is not None else ()
         if before and len(before[0].slopes) == len(selected.slopes):
             selected = before[0]
-        by_y, by_slope = _derivatives(equations, structure, selected, numbers, t, y)
-        by_slope = np.where(matrix == 0, 0, by_slope)
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
+        structure = _with_elimination(structure, places, selected, places[list(left)].any(0))
+        by_y, by_slope = _derivatives(equations, structure, numbers, t, y)
+        by_slope = np.where(matrix == 0, 0, by_slope)
         with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
         new = _unless_roundoff(with_roundoff, terms)
         new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
-        met.append(len(_extended(new[:, new_unknowns[-1]], _NONE).equations) == len(new))
+        met.append(len(_extended(new[:, new_unknowns[-1]], NO_ROUND).equations) == len(new))
         computed = np.concatenate([computed, with_roundoff])
         gradients = np.concatenate([gradients, new])
-        independent = _extended(gradients, _NONE).equations
+        independent = _extended(gradients, NO_ROUND).equations
         if len(independent) < len(gradients):
             first = len(gradients) - len(left)
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
             raise Singular(tuple(blamed), absent)
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
+        last = LastConstraints(equations, structure)
+        places = places.copy()
+        places[list(left)] = find.matrix(last, 1, len(left))
+    every = tuple(range(y.size))
+    structure = _with_elimination(structure, places, Round(every, every), np.full(y.size, True))
     found = new_unknowns if all(met) else []
     return _with_unknowns(structure, gradients, computed, given, found)
+
+
+def _with_elimination(
+    structure: Structure,
+    places: Bool[np.ndarray, "n n"],
+    selected: Round,
+    needed: Bool[np.ndarray, " n"],
+) -> Structure:
+    """The structure with the elimination of one more round."""
+    found = None
+    if structure.eliminations or not structure.is_semi_explicit or not structure.rounds:
+        found = elimination(
+            places,
+            selected,
+            needed,
+            structure.left(0) if structure.rounds else (),
+            is_linear=structure.is_linear,
+            mass=structure.mass,
+        )
+    return dataclasses.replace(structure, eliminations=(*structure.eliminations, found))
+
+
+@dataclasses.dataclass(frozen=True)
+class LastConstraints:
+    """The constraints of the last round, as a function like those of `WithNumbers`."""
+
+    equations: WithNumbers
+    structure: Structure
+
+    def __call__(self, numbers: Numbers, t: Array, y: Array, slopes: Array) -> Array:
+        del slopes
+        reduction = Reduction(self.structure, ft.partial(self.equations, numbers), t, y)
+        return reduction.constraints(t, y)[-1]
 
 
 def _with_unknowns(
@@ -458,7 +462,7 @@ def _with_unknowns(
         return structure
     part = gradients[:, structure.algebraic]
     part = part[part.any(1)]
-    shares_free = len(_extended(part, _NONE).equations) < len(part)
+    shares_free = len(_extended(part, NO_ROUND).equations) < len(part)
     along = _null_space(by_slope, structure)
     by_free, with_roundoff = (
         _unless_roundoff(x @ along, abs(x) @ abs(along)) != 0 for x in (gradients, computed)
@@ -481,17 +485,16 @@ def _by_slope(equations: WithNumbers, numbers: Numbers, t: Array, y: Array, slop
     return jax.jacfwd(small(ft.partial(equations, numbers), t, y, slopes), 2)(t, y, slopes)
 
 
-@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1, 2)))
+@ft.partial(RunOnce, ft.partial(jax.jit, static_argnums=(0, 1)))
 def _derivatives(
     equations: WithNumbers,
     structure: Structure,
-    selected: Round,
     numbers: Numbers,
     t: Array,
     y: Array,
 ) -> tuple[Array, Array]:
     reduction = Reduction(structure, ft.partial(equations, numbers), t, y)
-    return reduction.derivatives(selected, t, y)
+    return reduction.derivatives(t, y)
 
 
 def _reduced(

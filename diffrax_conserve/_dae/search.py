@@ -24,7 +24,8 @@ from .._hashable import is_array
 from .._large.klu import available, why_not
 from .._tree import irregular_weights
 from .large_search import NotFound, find_large_structure
-from .reduction import Implicit, Numbers, Singular, Structure, find_structure
+from .places import Numbers
+from .reduction import Implicit, Singular, Structure, find_structure
 
 # General numbers of these sizes are tried in turn, until the equations are finite and regular:
 # exponentials of large numbers are infinite, and roots and logarithms need some signs.
@@ -115,7 +116,8 @@ class Search:
         except NotFound:
             if y.size > MOST_DENSE:
                 raise
-        return find_structure(*given, None if mass is None else mass.toarray(), known)
+        dense = None if mass is None else mass.toarray()
+        return find_structure(*given, dense, self._unknown, known)
 
 
 def _large_structure(equations: Any, numbers: Any, others: Any, t: Any, y: Any, *more: Any) -> Any:
