@@ -1,5 +1,6 @@
 """Newton's method for algebraic unknowns, from guesses that may be poor."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -145,22 +146,22 @@ def algebraic_newton(
     residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None = None
 ) -> Solved:
     """A root of the residual near `z`, as exact as rounding lets us see; NaN if none is found."""
-    z, at_rest, num_iterations, converged = error_oriented_newton(residual, z, sparse)
-
-    def at_roundoff() -> Bool[Array, ""]:
-        if sparse is not None:
-            return sparse.at_roundoff(residual, z)
-        g, jacobian, cancellation = cancellation_terms(residual, z)
-        limit = TOLERANCE_IN_EPS * eps_of(z)
-        scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + cancellation
-        # The square of a term may be infinite, and then so is the scale.
-        return jnp.all((jnp.abs(g) <= limit * scale) & (scale < jnp.inf))
-
-    unsure = at_rest & ~converged
-    found = at_rest & (
-        converged | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
-    )
+    z, at_rest, num_iterations, is_root = error_oriented_newton(residual, z, sparse)
+    found = at_rest & is_root
     return Solved(jnp.where(found, z, jnp.nan), found, num_iterations)
+
+
+def _at_roundoff(
+    residual: Residual, z: Float[Array, " m"], sparse: SparseNewton | None
+) -> Bool[Array, ""]:
+    """Whether a residual is one by roundoff of its terms."""
+    if sparse is not None:
+        return sparse.at_roundoff(residual, z)
+    g, jacobian, cancellation = cancellation_terms(residual, z)
+    limit = TOLERANCE_IN_EPS * eps_of(z)
+    scale = DenseRows(jacobian).absolute_matvec(jnp.abs(z)) + cancellation
+    # The square of a term may be infinite, and then so is the scale.
+    return jnp.all((jnp.abs(g) <= limit * scale) & (scale < jnp.inf))
 
 
 def error_oriented_newton(
@@ -174,8 +175,8 @@ def error_oriented_newton(
     changes of `z`, and does not depend on the units of the equations. A correction that is NaN is
     not accepted.
 
-    The iteration comes to rest where corrections have converged, which `aux` tells, or where none
-    helps, perhaps because of roundoff: whether that is a root, the residual must tell. The result
+    The iteration comes to rest where corrections have converged, or where none helps, perhaps
+    because of roundoff: whether that is a root, which `aux` tells, the residual decides. The result
     is NaN if corrections become infinite, or the Jacobian is singular.
     """
     eps = eps_of(z)
@@ -221,4 +222,7 @@ def error_oriented_newton(
 
     start = z, jnp.ones((), z.dtype), jnp.asarray(True), jnp.asarray(False)
     (z, *_, converged), at_rest, count, _ = iterate(advance, start, max_steps=MAX_NEWTON_STEPS)
-    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, converged)
+    unsure = at_rest & ~converged
+    at_roundoff = ft.partial(_at_roundoff, residual, z, sparse)
+    is_root = converged | lax.cond(any_lane(unsure), at_roundoff, lambda: jnp.asarray(False))
+    return Solved(jnp.where(at_rest, z, jnp.nan), at_rest, count, is_root)

@@ -231,8 +231,7 @@ class ManifoldProjection(ForwardingSolver):
         cause, is_final = self._failure(
             problem,
             state,
-            step.t0,
-            candidate,
+            wrapped,
             self._cannot_start(start_target, state, step, made_jump),
             y1,
             info,
@@ -353,17 +352,20 @@ class ManifoldProjection(ForwardingSolver):
         self,
         problem: Problem,
         state: State,
-        t0: RealScalarLike,
-        candidate: Float[Array, " n"],
+        wrapped: "_WrappedStep",
         cannot_start: Bool[Array, ""],
         y1: Float[Array, " n"],
         info: ProjectionInfo,
     ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
         """Why the step failed, 0 if it did not, and whether no shorter step would be better."""
-        t1, changes = problem.t, problem.changes
+        t1, changes, candidate = problem.t, problem.changes, wrapped.candidate
         assert changes is not None  # in the step of a solve
         time = jnp.maximum(jnp.abs(t1), state.first_step_size.astype(jnp.result_type(t1)))
-        is_final = cannot_start | is_shortest_step(t1 - t0, time, changes, candidate)
+        # An implicit method that finds no step returns the state at its start, which is no rest.
+        was_solved = wrapped.result == dfx.RESULTS.successful
+        moved = jnp.where(was_solved, changes, jnp.inf)
+        length = t1 - wrapped.step.t0
+        is_final = cannot_start | is_shortest_step(length, time, moved, candidate)
         correction, too_far = y1 - candidate, False
         if self.max_correction is not None:
             limit = jnp.asarray(self.max_correction, correction.dtype)

@@ -1,0 +1,97 @@
+"""Rectifiers of textbooks, as the nodal analysis states them, beside scipy on reduced equations."""
+
+import diffrax as dfx
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import diffrax_conserve as dfc
+
+from ..problems import TO_THE_END
+
+PEAK, FREQUENCY = 10.0, 100 * np.pi
+
+
+def source(t, module=jnp):
+    return PEAK * module.sin(FREQUENCY * t)
+
+
+def diode(voltage, module=jnp):
+    return 1e-12 * module.expm1(voltage / 0.02585)
+
+
+@eqx.filter_jit
+def solve(dae, y0, time, dt0, dtmax=None):
+    """The last state, the result, and how many steps were rejected."""
+    steps = dfx.PIDController(rtol=1e-6, atol=1e-6, dtmax=dtmax)
+    options = TO_THE_END | dict(stepsize_controller=steps)
+    solver = dae.wrap(dfc.Radau())
+    found = dfx.diffeqsolve(dae.term, solver, 0.0, time, dt0, y0, **options)
+    return found.ys[-1], found.result, found.stats["num_rejected_steps"]
+
+
+def doubler(t, y, slopes, args):
+    """Two diodes and two condensers charge to twice the peak of the source."""
+    v, by_slope = y[:3], slopes[:3]
+    charging = 1e-5 * (by_slope[0] - by_slope[1])
+    up, on = diode(-v[1]), diode(v[1] - v[2])
+    output = 1e-5 * by_slope[2] - on + v[2] / 1e5
+    return jnp.stack([y[3] + charging, on - up - charging, output, v[0] - source(t)])
+
+
+def test_a_step_in_which_newton_fails_is_tried_again():
+    """A first step that is far too long fails, with the voltage of the source far from where it
+    started, and the solve goes on with shorter ones: whether the projection of a failed step
+    succeeds says nothing."""
+
+    def slopes(t, v):
+        up, on = diode(-v[0], np), diode(v[0] - v[1], np)
+        rise = PEAK * FREQUENCY * np.cos(FREQUENCY * t)
+        return np.array([rise + (up - on) / 1e-5, (on - v[1] / 1e5) / 1e-5])
+
+    time = 4e-3
+    exact = solve_ivp(slopes, (0, time), [0.0, 0.0], "Radau", rtol=1e-9, atol=1e-9).y[:, -1]
+    dae = dfc.DAE(residual=doubler)
+    y0 = dae.consistent(jnp.zeros(4))
+    for dt0 in (1e-6, 1e-3, 4e-3):
+        y, result, num_rejected = solve(dae, y0, time, jnp.array(dt0))
+        assert result == dfx.RESULTS.successful
+        assert num_rejected > 0
+        np.testing.assert_allclose(y[1:3], exact, rtol=1e-5)
+
+
+def bridge(t, y, slopes, args):
+    """Four diodes, a condenser and a load behind a source with a leak to the ground."""
+    a, b, v, current = y
+    forth = current + diode(a - v) - diode(-a)
+    back = b / 1e6 - current + diode(b - v) - diode(-b)
+    load = 1e-4 * slopes[2] - diode(a - v) - diode(b - v) + v / 1e3
+    return jnp.stack([forth, back, load, a - b - source(t)])
+
+
+def test_diodes_that_block_leave_no_current_but_roundoff():
+    """The currents through two diodes are equal to the last digit then, and the current through the
+    source is the roundoff of their difference, in which no correction converges."""
+
+    def slope(t, y):
+        (v,) = y
+
+        def leak(b):
+            a = b + source(t, np)
+            through = diode(a - v, np) + diode(b - v, np) - diode(-a, np) - diode(-b, np)
+            return through + b / 1e6
+
+        b = brentq(leak, -2 * PEAK, 2 * PEAK, xtol=1e-13)
+        through = diode(b + source(t, np) - v, np) + diode(b - v, np)
+        return [(through - v / 1e3) / 1e-4]
+
+    dae, time = dfc.DAE(residual=bridge), 1.5e-2
+    y0 = dae.consistent(jnp.zeros(4))
+    y, result, _ = solve(dae, y0, time, jnp.array(1e-6), 1e-4)
+    assert result == dfx.RESULTS.successful
+    options = dict(rtol=1e-8, atol=1e-8, max_step=1e-4)
+    exact = solve_ivp(slope, (0, time), [0.0], "Radau", **options).y[0, -1]
+    np.testing.assert_allclose(y[2], exact, rtol=1e-5)
+    np.testing.assert_allclose(y[0] - y[1], source(time), rtol=1e-12)
