@@ -1,7 +1,9 @@
 """Rectifiers of textbooks, as the nodal analysis states them, beside scipy on reduced equations."""
 
+import functools as ft
+
 import diffrax as dfx
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -22,10 +24,11 @@ def diode(voltage, module=jnp):
     return 1e-12 * module.expm1(voltage / 0.02585)
 
 
-@eqx.filter_jit
-def solve(dae, y0, time, dt0, dtmax=None):
+# Optimised, as users compile: a product that is added to a sum has no roundoff of its own then.
+@ft.partial(jax.jit, static_argnums=0, compiler_options=dict(xla_backend_optimization_level="2"))
+def solve(dae, y0, time, dt0, dtmax=None, tol=1e-6):
     """The last state, the result, and how many steps were rejected."""
-    steps = dfx.PIDController(rtol=1e-6, atol=1e-6, dtmax=dtmax)
+    steps = dfx.PIDController(rtol=tol, atol=tol, dtmax=dtmax)
     options = TO_THE_END | dict(stepsize_controller=steps)
     solver = dae.wrap(dfc.Radau())
     found = dfx.diffeqsolve(dae.term, solver, 0.0, time, dt0, y0, **options)
@@ -89,9 +92,10 @@ def test_diodes_that_block_leave_no_current_but_roundoff():
 
     dae, time = dfc.DAE(residual=bridge), 1.5e-2
     y0 = dae.consistent(jnp.zeros(4))
-    y, result, _ = solve(dae, y0, time, jnp.array(1e-6), 1e-4)
+    y, result, _ = solve(dae, y0, time, jnp.array(1e-6), dtmax=1e-4, tol=1e-5)
     assert result == dfx.RESULTS.successful
     options = dict(rtol=1e-8, atol=1e-8, max_step=1e-4)
-    exact = solve_ivp(slope, (0, time), [0.0], "Radau", **options).y[0, -1]
+    with np.errstate(over="ignore"):
+        exact = solve_ivp(slope, (0, time), [0.0], "Radau", **options).y[0, -1]
     np.testing.assert_allclose(y[2], exact, rtol=1e-5)
     np.testing.assert_allclose(y[0] - y[1], source(time), rtol=1e-12)
