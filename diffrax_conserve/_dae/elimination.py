@@ -1,13 +1,17 @@
-"""How the slopes are found that constraints need: by constants, in turn, or together.
+"""How the slopes are found that constraints need: by constants, or block by block.
 
-Of most equations each contains one slope, so that elimination is division. Only slopes on which a
-constraint depends are found. With all of them, the constraints of a linkage with 35 unknowns solved
-for 27 slopes at once, and each derivative of such a solution costs as much as many of them.
+The equations that are selected are a square system for the slopes that are selected. Only slopes on
+which a constraint depends are found, in the order of its block triangular form (A. Pothen and
+C.-J. Fan, *Computing the block triangular form of a sparse matrix*, ACM Trans. Math. Softw. 16,
+1990). Most blocks are single equations with one unknown slope. If all slopes were found at once,
+the constraints of a linkage with 35 unknowns would contain the solution of a system of 27, and each
+derivative of it would cost as much as many of them.
 """
 
 # The types of scipy's sparse arrays are incomplete.
 # pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
-# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false, reportOptionalIterable=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
+# pyright: reportOptionalIterable=false, reportOperatorIssue=false
 
 import dataclasses
 import functools as ft
@@ -20,10 +24,25 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
-from scipy.sparse.csgraph import maximum_bipartite_matching
+from scipy.sparse.csgraph import (
+    breadth_first_order,
+    connected_components,
+    maximum_bipartite_matching,
+)
 
+from .._large.elimination import combinations
 from .._numerics.implicit import root
 from .newton import algebraic_newton, solve_equilibrated
+
+# In a large system at most so many slopes are solved for together. A matrix of eliminated slopes
+# with more elements for each row is given up: each constraint would contain so many unknowns.
+_MOST_COUPLED = 64
+# So many blocks are solved one after the other. In a small system the rest is one block.
+_MOST_LEVELS = 8
+
+
+class NotFound(Exception):
+    """Why the structure was not found."""
 
 
 class Round(NamedTuple):
@@ -33,7 +52,12 @@ class Round(NamedTuple):
     slopes: tuple[int, ...]
 
 
-NO_ROUND = Round((), ())
+class Blocks(NamedTuple):
+    """Square systems of one size that do not depend on each other: a row of equations and of slopes
+    for each."""
+
+    equations: tuple[tuple[int, ...], ...]
+    slopes: tuple[tuple[int, ...], ...]
 
 
 class SparseMatrix:
@@ -77,14 +101,12 @@ class Elimination:
 
     - `constant`: where `∂F/∂y'` is constant, slopes are this matrix times the equations at no
       slopes; `None` if there are none of these.
-    - `levels`: equations that are linear in the slopes, each with one that is not yet known.
-    - `coupled`: the equations that are solved together for the others.
-    - `as_given`: whether none of them is the derivative of a constraint.
+    - `blocks`: the blocks that give the others, in their order.
+    - `as_given`: whether no equation in them is the derivative of a constraint.
     """
 
     constant: SparseMatrix | None = None
-    levels: tuple[Round, ...] = ()
-    coupled: Round = NO_ROUND
+    blocks: tuple[Blocks, ...] = ()
     is_linear: bool = True
     as_given: bool = False
 
@@ -95,80 +117,140 @@ class Elimination:
         slopes = jnp.zeros_like(like)
         if self.constant is not None:
             slopes = self.constant @ equations(slopes)
-        for level in self.levels:
-            rows, columns = (np.array(x, int) for x in level)
-            one = jnp.zeros_like(like).at[columns].set(1)
-            left, by_slope = jax.jvp(equations, (slopes,), (one,))
-            slopes = slopes.at[columns].set(-left[rows] / by_slope[rows])
-        if self.coupled.slopes:
-            slopes = self._together(equations, slopes)
+        for one in self.blocks:
+            rows, columns = (np.array(x, int) for x in one)
+            solve = _linear_blocks if self.is_linear else _nonlinear_block
+            slopes = slopes.at[columns].set(solve(equations, slopes, rows, columns))
         return slopes
 
-    def _together(
-        self, equations: Callable[[Array], Array], slopes: Float[Array, " n"]
-    ) -> Float[Array, " n"]:
-        rows, columns = (np.array(x, int) for x in self.coupled)
 
-        def residual(some: Array) -> Array:
-            return equations(slopes.at[columns].set(some))[rows]
+def _linear_blocks(
+    equations: Callable[[Array], Array], slopes: Float[Array, " n"], rows: Any, columns: Any
+) -> Float[Array, "b k"]:
+    value, along = jax.linearize(equations, slopes)
+    size = columns.shape[1]
+    directions = jnp.zeros((size, slopes.size), slopes.dtype).at[np.arange(size), columns].set(1)
+    matrix = jnp.moveaxis(jax.vmap(along)(directions)[:, rows], 0, -1)
+    return _solved(matrix, -value[rows])
 
-        begin = jnp.zeros(columns.size, slopes.dtype)
-        if self.is_linear:
-            both = jax.jacfwd(lambda some: 2 * (residual(some),), has_aux=True)
-            matrix, value = both(begin)
-            found = solve_equilibrated(matrix, -value)
-        else:
-            newton = ft.partial(algebraic_newton, residual)
-            found = root(residual, newton, begin, solve_equilibrated).y
-        return slopes.at[columns].set(found)
+
+def _solved(matrix: Float[Array, "b k k"], b: Float[Array, "b k"]) -> Float[Array, "b k"]:
+    """`matrix⁻¹ b`. For one and two unknowns that is written out, as a call of LAPACK is not."""
+    if b.shape[1] == 1:
+        return b / matrix[:, 0]
+    if b.shape[1] == 2:
+        p, q, r, s = (matrix[:, i, j] for i in (0, 1) for j in (0, 1))
+        top = jnp.stack([s * b[:, 0] - q * b[:, 1], p * b[:, 1] - r * b[:, 0]], axis=1)
+        return top / (p * s - q * r)[:, None]
+    return jax.vmap(solve_equilibrated)(matrix, b)
+
+
+def _nonlinear_block(
+    equations: Callable[[Array], Array], slopes: Float[Array, " n"], rows: Any, columns: Any
+) -> Float[Array, "1 k"]:
+    residual = lambda some: equations(slopes.at[columns[0]].set(some))[rows[0]]  # noqa: E731
+    begin = jnp.zeros(columns.size, slopes.dtype)
+    return root(residual, ft.partial(algebraic_newton, residual), begin, solve_equilibrated).y[None]
 
 
 def elimination(
-    places: Bool[np.ndarray, "n n"],
+    places: sp.csr_array,
     selected: Round,
     needed: Bool[np.ndarray, " n"],
-    differentiated: tuple[int, ...],
+    differentiated: Any,
     *,
     is_linear: bool,
-    mass: np.ndarray | None,
+    mass: sp.csr_array | None,
+    is_large: bool = False,
 ) -> Elimination:
-    """How the needed ones of the slopes that are selected follow. The matrix `∂F/∂y'` has elements
-    in these places, and, where no constraint is differentiated, may be a constant `mass`."""
-    rows, columns = _closed(places, selected, needed)
-    as_given = not np.isin(rows, differentiated).any()
-    kind = Elimination(is_linear=is_linear, as_given=as_given)
-    if as_given and is_linear and mass is not None and rows.size:
-        inverse = np.zeros(mass.shape)
-        inverse[np.ix_(columns, rows)] = -np.linalg.inv(mass[np.ix_(rows, columns)])
-        return dataclasses.replace(kind, constant=SparseMatrix(inverse))
-    levels, unknown = [], np.isin(np.arange(len(places)), columns)
-    while is_linear:
-        unsolved = places & unknown
-        single = rows[unsolved[rows].sum(1) == 1]
-        if not single.size:
+    """How the needed ones of the slopes that are selected follow from equations that depend on the
+    slopes in these `places`. Those that are not `differentiated` may have a constant `mass`. What
+    would cost too much in a large system raises `NotFound`."""
+    rows, columns = (np.array(x, int) for x in selected)
+    closed = np.zeros(0, int), np.zeros(0, int)
+    if mass is not None and is_linear:
+        closed = _closed(mass, np.setdiff1d(rows, differentiated), columns)
+    at = np.isin(rows, closed[0]), np.isin(columns, closed[1])
+    rows, columns = rows[~at[0]], columns[~at[1]]
+    rows = rows[maximum_bipartite_matching(places[rows][:, columns], perm_type="row")]
+    depends = places[rows][:, columns]  # each slope on others, by its own equation
+    wanted = _reachable(depends, needed[columns])
+    rows, columns, depends = rows[wanted], columns[wanted], depends[wanted][:, wanted]
+    blocks = _blocks(rows, columns, depends, together=not is_linear, is_large=is_large)
+    used = places[rows]
+    needed = needed | (np.bincount(used.indices, minlength=needed.size) > 0)
+    constant = None
+    if mass is not None and (those := np.intersect1d(closed[1], np.flatnonzero(needed))).size:
+        constant = _inverse(mass, closed, those, is_large)
+    return Elimination(constant, blocks, is_linear, not np.isin(rows, differentiated).any())
+
+
+def _reachable(depends: sp.csr_array, start: Bool[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
+    """What the start depends on, with the start."""
+    if not (size := start.size):
+        return start
+    first = sp.csr_array(start[None].astype(float))
+    graph = sp.block_array([[None, first], [sp.csr_array((size, 1)), depends]], format="csr")
+    found = breadth_first_order(graph, 0, return_predecessors=False)
+    return np.isin(np.arange(1, size + 1), found)
+
+
+def _blocks(
+    rows: np.ndarray, columns: np.ndarray, depends: sp.csr_array, *, together: bool, is_large: bool
+) -> tuple[Blocks, ...]:
+    """The blocks in their order: slopes that depend on each other are in one."""
+    if not columns.size:
+        return ()
+    count, block = connected_components(depends, connection="strong")
+    on, after = block[sp.coo_array(depends).coords[1]], block[sp.coo_array(depends).coords[0]]
+    inside = on == after
+    level, settled = np.zeros(count, int), False
+    for _ in range(_MOST_LEVELS):
+        before = level.copy()
+        np.maximum.at(level, after[~inside], before[on[~inside]] + 1)
+        settled = np.array_equal(level, before)
+        if settled:
             break
-        found, first = np.unique(unsolved[single].argmax(1), return_index=True)
-        levels.append(_round(single[first], found))
-        unknown[found] = False
-    solved = np.array([i for one in levels for i in one.equations], int)
-    coupled = _round(np.setdiff1d(rows, solved), np.flatnonzero(unknown))
-    return dataclasses.replace(kind, levels=tuple(levels), coupled=coupled)
-
-
-def _round(rows: np.ndarray, columns: np.ndarray) -> Round:
-    return Round(tuple(rows.tolist()), tuple(columns.tolist()))
+    sizes = np.bincount(block, minlength=count)
+    if is_large and (not settled or sizes.max() > _MOST_COUPLED):
+        raise NotFound("slopes that a constraint needs are coupled, and not by constants")
+    if together or not settled:
+        return (Blocks((tuple(rows.tolist()),), (tuple(columns.tolist()),)),)
+    order, found = np.argsort(block, kind="stable"), []
+    starts = np.cumsum(sizes) - sizes
+    for one, size in np.unique(np.stack([level, sizes], 1), axis=0):
+        those = np.flatnonzero((level == one) & (sizes == size))
+        at = order[starts[those][:, None] + np.arange(size)]
+        found.append(Blocks(*(tuple(map(tuple, x[at].tolist())) for x in (rows, columns))))
+    return tuple(found)
 
 
 def _closed(
-    places: Bool[np.ndarray, "n n"], selected: Round, needed: Bool[np.ndarray, " n"]
+    mass: sp.csr_array, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The fewest of the equations that are selected that determine the slopes that are needed, and
-    these slopes with those that come with them. Each slope is matched with an equation that
-    contains it, which asks for all slopes in it."""
-    rows, columns = (np.array(x, int) for x in selected)
-    part = places[np.ix_(rows, columns)]
-    matched = maximum_bipartite_matching(sp.csr_array(part), perm_type="row")
-    asked, before = needed[columns], None
-    while not np.array_equal(asked, before):
-        before, asked = asked, asked | part[matched[asked]].any(0)
-    return rows[matched[asked]], columns[asked]
+    """Those rows and columns of independent rows that are as many in their connected component, so
+    that these slopes are determined by these equations alone."""
+    part = mass[rows][:, columns]
+    both = sp.block_array([[None, part], [part.T, None]], format="csr")
+    count, component = connected_components(both, directed=False)
+    of_rows, of_columns = np.split(component, [rows.size])
+    sizes = (np.bincount(x, minlength=count) for x in (of_rows, of_columns))
+    is_square = np.equal(*sizes)
+    return rows[is_square[of_rows]], columns[is_square[of_columns]]
+
+
+def _inverse(
+    mass: sp.csr_array, closed: tuple[np.ndarray, np.ndarray], needed: np.ndarray, is_large: bool
+) -> SparseMatrix:
+    """The matrix that gives the slopes that are needed from the equations without slopes."""
+    rows, columns = closed
+    at = np.argsort(columns)[np.searchsorted(np.sort(columns), needed)]
+    one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
+    inverse = sp.coo_array(combinations(one, mass[rows][:, columns]))
+    if is_large and inverse.nnz > _MOST_COUPLED * len(at):
+        raise NotFound(
+            "the slopes of too many unknowns are coupled, as those of finite elements with a "
+            "consistent mass matrix: use a diagonal one"
+        )
+    (i, j), values = inverse.coords, np.asarray(inverse.data)
+    return SparseMatrix(sp.csr_array((-values, (needed[i], rows[j])), mass.shape))

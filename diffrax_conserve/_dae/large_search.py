@@ -26,7 +26,7 @@ from .._fast.run_once import RunOnce
 from .._large.detection import NotSparse
 from .._large.elimination import TooFull, combinations, exact_sum, extended
 from .._large.klu import SparseJacobian
-from .elimination import Elimination, Round, SparseMatrix
+from .elimination import Elimination, NotFound, Round, SparseMatrix, elimination
 from .large import Large
 from .places import FindPlaces, Numbers
 from .reduction import LastConstraints, Singular, Structure, WithNumbers, general_states
@@ -34,16 +34,7 @@ from .reduction import LastConstraints, Singular, Structure, WithNumbers, genera
 # The largest index that is looked for. Each differentiation makes the functions larger, and
 # mechanisms have three.
 MAX_INDEX = 3
-# A matrix of eliminated slopes with more than this many elements for each row is given up: each
-# constraint would contain so many unknowns.
-_MOST_TERMS = 64
 _NOT_CONSTANT = "the coefficients of their slopes are coupled, and not constant"
-# So many equations are solved one after the other for a slope that a constraint needs.
-_LEVELS = 8
-
-
-class NotFound(Exception):
-    """Why the structure was not found."""
 
 
 @contextlib.contextmanager
@@ -122,7 +113,7 @@ def find_large_structure(
             structure.is_semi_explicit,
             _pattern(matrix),
         )
-        further = ft.partial(_with_round, structure, selected, matrix, needed)
+        further = ft.partial(_with_round, structure, selected, matrix, in_places, needed)
         large, found = once((structure, one, *kind), further)
         structure = dataclasses.replace(
             structure,
@@ -222,22 +213,20 @@ def _replaced(matrix: sp.csr_array, rows: np.ndarray, by: sp.csr_array) -> sp.cs
 
 
 def _with_round(
-    structure: Structure, selected: tuple[np.ndarray, ...], matrix: sp.csr_array, needed: np.ndarray
+    structure: Structure,
+    selected: tuple[np.ndarray, ...],
+    matrix: sp.csr_array,
+    in_places: tuple[np.ndarray, ...],
+    needed: np.ndarray,
 ) -> tuple[Large, Elimination | None]:
     """What one more round needs. It differentiates some of the constraints before it, and needs the
     slopes of the unknowns in these."""
     rows, columns = selected
-    large, k = structure.large, structure.index
+    n, large = structure.size, structure.large
     assert large is not None
-    given, others = rows, np.zeros(0, int)
-    if k:
-        others = np.array(structure.left(0), int)
-        given = np.setdiff1d(rows, others)
-    structure = dataclasses.replace(
-        structure, rounds=(*structure.rounds, Round(_tuple(rows), _tuple(columns)))
-    )
+    differentiated = np.array(structure.left(0), int) if structure.rounds else np.zeros(0, int)
     constant = structure.is_linear and structure.mass is not None
-    if k == 0:
+    if not structure.rounds:
         large = dataclasses.replace(large, along=_along(matrix, rows, columns, constant))
         if structure.is_semi_explicit:
             return large, None
@@ -246,52 +235,23 @@ def _with_round(
                 "equations without slopes are combinations of others, and the coefficients of "
                 "their slopes are not constant"
             )
-        left = np.array(structure.left(0), int)
+        left = np.setdiff1d(np.arange(n), rows)
         share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
-        whole = _spread(sp.eye_array(len(left), format="csr"), None, left, structure.size)
-        whole = whole - _spread(share, None, rows, structure.size)
+        whole = _spread(sp.eye_array(len(left), format="csr"), None, left, n)
+        whole = whole - _spread(share, None, rows, n)
         return dataclasses.replace(large, combinations=SparseMatrix(whole)), None
-    closed = rows[:0], columns[:0]
-    if constant:
-        closed = _closed(structure.mass, given, columns)
-    needed = np.intersect1d(needed, columns)
-    levels, needed = _levels(matrix, rows, columns, needed, closed[1])
-    if levels and not structure.is_linear:
-        raise NotFound("they are not linear in the slopes that a constraint needs")
-    inverse = _inverse(structure.mass, closed, needed)
-    return large, Elimination(inverse, levels, as_given=not levels)
-
-
-def _closed(
-    mass: sp.csr_array, rows: np.ndarray, columns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Those rows and columns of independent rows that are as many in their connected component, so
-    that these slopes are determined by these equations alone."""
-    part = mass[rows][:, columns]
-    both = sp.block_array([[None, part], [part.T, None]], format="csr")
-    count, component = sp.csgraph.connected_components(both, directed=False)
-    of_rows, of_columns = np.split(component, [rows.size])
-    sizes = (np.bincount(x, minlength=count) for x in (of_rows, of_columns))
-    is_square = np.equal(*sizes)
-    return rows[is_square[of_rows]], columns[is_square[of_columns]]
-
-
-def _inverse(
-    mass: Any, closed: tuple[np.ndarray, np.ndarray], needed: np.ndarray
-) -> SparseMatrix | None:
-    """The matrix that gives the slopes that are needed from the equations without slopes."""
-    if not needed.size:
-        return None
-    rows, columns = closed
-    at = np.argsort(columns)[np.searchsorted(np.sort(columns), needed)]
-    one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
-    inverse = combinations(one, mass[rows][:, columns])
-    if inverse.nnz > _MOST_TERMS * len(at):
-        raise NotFound(
-            "the slopes of too many unknowns are coupled, as those of finite elements with a "
-            "consistent mass matrix: use a diagonal one"
-        )
-    return SparseMatrix(_spread(-inverse, needed, rows, mass.shape[0]))
+    if needed.size and not structure.is_linear:
+        raise NotFound("they are not linear in slopes that a constraint needs")
+    ones = np.ones(len(in_places[0]), bool)
+    return large, elimination(
+        sp.csr_array((ones, in_places), (n, n)),
+        Round(_tuple(rows), _tuple(columns)),
+        np.isin(np.arange(n), needed),
+        differentiated,
+        is_linear=True,
+        mass=structure.mass,
+        is_large=True,
+    )
 
 
 def _with_slopes(
@@ -332,38 +292,6 @@ def _spread(
     row = at.coords[0] if rows is None else rows[at.coords[0]]
     shape = matrix.shape[0] if rows is None else size
     return sp.csr_array((at.data, (row, columns[at.coords[1]])), (shape, size))
-
-
-def _levels(
-    matrix: sp.csr_array,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    needed: np.ndarray,
-    given: np.ndarray,
-) -> tuple[tuple[Round, ...], np.ndarray]:
-    """Equations that are solved one after the other, each for one slope that is needed, if some are
-    given; and which of those are needed."""
-    at = sp.coo_array(matrix[rows][:, columns])
-    i, j = rows[at.coords[0]], columns[at.coords[1]]
-    known, levels = np.isin(np.arange(matrix.shape[0]), given), []
-    for _ in range(_LEVELS):
-        unsolved = ~known[j]
-        counts = np.bincount(i[unsolved], minlength=matrix.shape[0])
-        single = unsolved & (counts[i] == 1)
-        column, first = np.unique(j[single], return_index=True)
-        if not column.size:
-            break
-        levels.append((i[single][first], column))
-        known[column] = True
-    if not known[needed].all():
-        raise NotFound("slopes that a constraint needs are coupled, and not by constants")
-    wanted, kept = np.isin(np.arange(matrix.shape[0]), needed), []
-    for row, column in reversed(levels):
-        some = wanted[column]
-        if some.any():
-            kept.append(Round(_tuple(row[some]), _tuple(column[some])))
-        wanted[j[np.isin(i, row[some])]] = True
-    return tuple(reversed(kept)), np.intersect1d(np.flatnonzero(wanted), given)
 
 
 # ---- Numbers ----

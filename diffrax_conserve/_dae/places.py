@@ -35,7 +35,7 @@ class FindPlaces:
         shape = closed.out_avals[0].shape[0], self.zeros.size
         return SparseJacobian(*jacobian_places(closed), shape)
 
-    def matrix(self, fn: Any, argument: int, number: int) -> Bool[np.ndarray, "m n"]:
+    def dense(self, fn: Any, argument: int, number: int) -> Bool[np.ndarray, "m n"]:
         """As `of` a `number` of equations of a small system; all places if these are nearly all."""
         shape = number, self.zeros.size
         try:

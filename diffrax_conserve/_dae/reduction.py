@@ -23,6 +23,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Array, Bool, Float
 
 from .._constants import REGULARISATION_POWER
@@ -32,7 +33,7 @@ from .._fast.scalars import small
 from .._numerics.implicit import root
 from .._numerics.rows import AbstractRows
 from .._tree import eps_of, irregular_weights
-from .elimination import NO_ROUND, Elimination, Round, elimination
+from .elimination import Blocks, Elimination, Round, elimination
 from .large import Large
 from .newton import SparseNewton, algebraic_newton
 from .places import FindPlaces, Numbers
@@ -297,7 +298,8 @@ class Reduction:
     def _by_slopes(self, t: Array, y: Array) -> Float[Array, "n n"]:
         slopes = jnp.zeros_like(y)
         if not self.structure.is_linear:
-            together = Elimination(coupled=self.structure.rounds[0], is_linear=False)
+            selected = Blocks(*((x,) for x in self.structure.rounds[0]))
+            together = Elimination(blocks=(selected,), is_linear=False)
             slopes = together.slopes(ft.partial(self.equations, t, y), y)
         return jax.jacfwd(self.equations, 2)(t, y, slopes)
 
@@ -375,7 +377,7 @@ def find_structure(
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
         other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    selected, given = _extended(matrix, NO_ROUND), matrix.copy()
+    selected, given = _extended(matrix, _NO_ROUND), matrix.copy()
     gradients = computed = np.zeros((0, y.size))  # without and with roundoff
     both = np.stack([matrix, other])
     rest = np.delete(both, selected.equations, axis=1)
@@ -384,7 +386,7 @@ def find_structure(
         y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
     )
     find = FindPlaces(numbers, unknown, t, y)
-    places = find.matrix(equations, 2, y.size)
+    places = find.dense(equations, 2, y.size)
     new_unknowns, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         before = known.rounds[structure.index :] if known is not None else ()
@@ -392,16 +394,17 @@ def find_structure(
             selected = before[0]
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
-        structure = _with_elimination(structure, places, selected, places[list(left)].any(0))
+        needed = np.any(places[list(left)], axis=0)
+        structure = _with_elimination(structure, places, selected, needed)
         by_y, by_slope = _derivatives(equations, structure, numbers, t, y)
         by_slope = np.where(matrix == 0, 0, by_slope)
         with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
         new = _unless_roundoff(with_roundoff, terms)
         new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
-        met.append(len(_extended(new[:, new_unknowns[-1]], NO_ROUND).equations) == len(new))
+        met.append(len(_extended(new[:, new_unknowns[-1]], _NO_ROUND).equations) == len(new))
         computed = np.concatenate([computed, with_roundoff])
         gradients = np.concatenate([gradients, new])
-        independent = _extended(gradients, NO_ROUND).equations
+        independent = _extended(gradients, _NO_ROUND).equations
         if len(independent) < len(gradients):
             first = len(gradients) - len(left)
             blamed = (i for k, i in enumerate(left) if first + k not in independent)
@@ -409,7 +412,7 @@ def find_structure(
         matrix[list(left)] = new  # `∂/∂y'` of `∂h/∂t + ∂h/∂y y'`
         last = LastConstraints(equations, structure)
         places = places.copy()
-        places[list(left)] = find.matrix(last, 1, len(left))
+        places[list(left)] = find.dense(last, 1, len(left))
     every = tuple(range(y.size))
     structure = _with_elimination(structure, places, Round(every, every), np.full(y.size, True))
     found = new_unknowns if all(met) else []
@@ -425,13 +428,14 @@ def _with_elimination(
     """The structure with the elimination of one more round."""
     found = None
     if structure.eliminations or not structure.is_semi_explicit or not structure.rounds:
+        mass = structure.mass
         found = elimination(
-            places,
+            sp.csr_array(places),
             selected,
             needed,
             structure.left(0) if structure.rounds else (),
             is_linear=structure.is_linear,
-            mass=structure.mass,
+            mass=None if mass is None else sp.csr_array(mass),
         )
     return dataclasses.replace(structure, eliminations=(*structure.eliminations, found))
 
@@ -462,7 +466,7 @@ def _with_unknowns(
         return structure
     part = gradients[:, structure.algebraic]
     part = part[part.any(1)]
-    shares_free = len(_extended(part, NO_ROUND).equations) < len(part)
+    shares_free = len(_extended(part, _NO_ROUND).equations) < len(part)
     along = _null_space(by_slope, structure)
     by_free, with_roundoff = (
         _unless_roundoff(x @ along, abs(x) @ abs(along)) != 0 for x in (gradients, computed)
@@ -475,6 +479,9 @@ def _with_unknowns(
         by_free=by_free if must_know else None,
         new_unknowns=tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns),
     )
+
+
+_NO_ROUND = Round((), ())
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.

@@ -23,7 +23,8 @@ from .._constants import MIN_KLU
 from .._hashable import is_array
 from .._large.klu import available, why_not
 from .._tree import irregular_weights
-from .large_search import NotFound, find_large_structure
+from .elimination import NotFound
+from .large_search import find_large_structure
 from .places import Numbers
 from .reduction import Implicit, Singular, Structure, find_structure
 
