@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
+from diffrax_conserve._dae.dae import _structure
 
 from ..problems import EPS, refused
 
@@ -80,6 +81,57 @@ def test_numbers_of_python_are_part_of_the_equations():
     assert len(dfc._dae.dae._SEARCHES) == before + 1
     asked = dfc.DAE(residual=lambda t, y, dy, a: (dy[0] - y[1], y[1] - y[0] if a > 0 else dy[1]))
     assert [asked.report(GUESS, args=a).index for a in (1.0, -1.0)] == [1, 0]
+
+
+def test_a_number_that_is_zero_where_the_structure_is_taken():
+    """It may be another one later, and has a derivative: here it brings the slope of a further
+    unknown into a hidden constraint."""
+
+    def residual(t, y, dy, share):
+        (x, force, other), (dx, _, dother) = y, dy
+        return dx - force, x + share * other - jnp.sin(t), dother - other**2
+
+    dae, state = dfc.DAE(residual=residual), (jnp.array(0.2), jnp.array(1.0), jnp.array(0.7))
+    there = dae.at(state, args=jnp.array(0.0))
+    force = lambda share: there.consistent(state, args=share)[1]  # noqa: E731
+    for share in (0.0, 0.3):
+        value, by_share = jax.jit(lambda x: jax.jvp(force, (x,), (1.0,)))(share)
+        _, _, other = there.consistent(state, args=share)
+        assert abs(value - (1 - share * other**2)) < 8 * EPS
+        shift = 1e-6
+        difference = (force(share + shift) - force(share - shift)) / (2 * shift)
+        assert abs(by_share - difference) < 1e-8
+
+
+def linkage(t, y, dy, args):
+    """A four-bar linkage of three rods, each with its two places and its angle, whose joints pull
+    by forces that are given as what they do to the rods: index 3."""
+    (place, speed, force, pull), (dplace, dspeed, _, _) = y, dy
+
+    def joints(place):
+        along = jnp.stack([jnp.cos(place[:, 2]), jnp.sin(place[:, 2])], 1) / 2
+        begin, end = place[:, :2] - along, place[:, :2] + along
+        ground = jnp.concatenate([begin[0], end[-1] - jnp.array([1.5, 0.0])])
+        return jnp.append(ground, end[:-1] - begin[1:])
+
+    weight = jnp.array([0.0, -9.81, 0.0])
+    mass = jnp.array([1.0, 1.0, 1 / 12]) * args[:, None]
+    pulled = jax.vjp(joints, place)[1](force)[0]
+    equation = mass * dspeed - args[:, None] * weight - pull
+    return dplace - speed, equation, pull - pulled, joints(place)
+
+
+def test_hidden_constraints_solve_for_one_slope_at_a_time():
+    """Where the equations do: else each derivative of such a constraint costs as much as many
+    linear systems."""
+    rods = jnp.zeros((3, 3)), jnp.zeros((3, 3)), jnp.zeros(8), jnp.zeros((3, 3))
+    structure = _structure(dfc.DAE(residual=linkage), 0.0, rods, jnp.ones(3))
+    assert (structure.index, structure.freedom) == (3, 2)
+    first, *others, last = structure.eliminations
+    assert first is None
+    solved = [[np.shape(one.slopes) for one in found.blocks] for found in others]
+    assert solved == [[(9, 1)], [(12, 1)]]
+    assert sum(map(np.prod, (np.shape(one.slopes) for one in last.blocks))) == 35
 
 
 def test_integers_in_args_may_change():
