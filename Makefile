@@ -122,7 +122,7 @@ coverage: $(TEST) ## which lines the fast tests execute
 
 # Some projections, solves, systems and networks.
 CHECKED := tests/laws/test_projection.py tests/solver/test_options.py tests/systems/test_paper.py \
-  tests/network/test_layer.py
+  tests/network/test_layer.py tests/solver/test_dae_structure.py tests/solver/test_dae_circuits.py
 
 # Laws that hold to roundoff or bit for bit, which what XLA fuses might break: `make test` compiles
 # without its optimisations.

@@ -12,7 +12,7 @@ import functools as ft
 import itertools as it
 from collections.abc import Callable, Sequence
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsIndex
 
 import jax
 import jax.core
@@ -266,7 +266,7 @@ class _Program:
             for k, x in enumerate(out)
         ]
 
-    def _split(self, i: int, sizes: Sequence[int], axis: int) -> list[int]:
+    def _split(self, i: int, sizes: Sequence[SupportsIndex], axis: int) -> list[int]:
         shape, ends = self.values[i].shape, it.accumulate(map(int, sizes))
         low, high, parts = [0] * len(shape), [*shape], []
         for size, end in zip(sizes, ends, strict=True):

@@ -23,7 +23,7 @@ import functools as ft
 import itertools as it
 from collections.abc import Callable, Sequence
 from math import prod
-from typing import Any
+from typing import Any, SupportsIndex
 
 import jax
 import jax.core
@@ -160,7 +160,9 @@ _CALLS = frozenset({"closed_call", "core_call", "checkpoint", "remat2"})
 _CALLS_WITH_A_RULE = frozenset({"custom_jvp_call", "custom_vjp_call"})
 
 
-def _broadcast(x: _Places, shape: Sequence[int], broadcast_dimensions: Sequence[int]) -> _Places:
+def _broadcast(
+    x: _Places, shape: Sequence[int], broadcast_dimensions: Sequence[SupportsIndex]
+) -> _Places:
     expanded = [1] * len(shape)
     for axis, size in zip(broadcast_dimensions, x.shape, strict=True):
         expanded[axis] = size
@@ -176,7 +178,7 @@ def _pad(x: _Places, value: _Places, padding_config: Sequence[Any]) -> _Places:
         kept.append(slice(max(-low, 0), last + high if high < 0 else None))
     out = np.full(out_shape, value.item())
     out[tuple(inside)] = x
-    return out[tuple(kept)]
+    return np.asarray(out[tuple(kept)])
 
 
 def moved_elements(
@@ -237,9 +239,9 @@ MOVES: dict[str, Callable[..., _Places | list[_Places]]] = {
         range(x.ndim) if dimensions is None else dimensions
     ).reshape(new_sizes),
     "rev": lambda x, dimensions: np.flip(x, dimensions),
-    "slice": lambda x, start_indices, limit_indices, strides=None: x[
-        tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))
-    ],
+    "slice": lambda x, start_indices, limit_indices, strides=None: np.asarray(
+        x[tuple(map(slice, start_indices, limit_indices, strides or [1] * x.ndim))]
+    ),
     "split": lambda x, sizes, axis: np.split(x, np.cumsum(sizes)[:-1], axis),
     "squeeze": lambda x, dimensions: x.squeeze(dimensions),
     "stack": lambda *xs, axis: np.stack(xs, axis),
@@ -386,7 +388,7 @@ class _Program:
         return np.array(out, int).reshape(inputs[0].shape)
 
     def _reduce(
-        self, name: str, fn: Any, places: _Places, axes: tuple[int, ...], dtype: Any
+        self, name: str, fn: Any, places: _Places, axes: Sequence[SupportsIndex], dtype: Any
     ) -> _Places:
         self._count(places.size)
         places = np.moveaxis(places, axes, range(-len(axes), 0))
@@ -423,7 +425,7 @@ class _Program:
         takes, updates = name in TAKES, inputs[1 if name.startswith("dynamic") else -1]
         at, counted = moved_by(eqn, operand.shape, updates.shape, indices)
         if takes and np.all(counted):
-            return [operand[at]]
+            return [np.asarray(operand[at])]
         if takes:
             filling = params["fill_value"]
             if filling is None and not jnp.issubdtype(dtype, jnp.inexact):

@@ -231,7 +231,7 @@ def _dependence(eqn: Any, xs: list[_Array], out: list[_Array]) -> list[sp.csr_ar
     name, params, x, one = eqn.primitive.name, eqn.params, xs[0], out[0]
     if name in MOVES:
         starts = np.cumsum([0, *(x.size for x in xs)])
-        places = [x.places + start for x, start in zip(xs, starts, strict=False)]
+        places = [np.asarray(x.places + start) for x, start in zip(xs, starts, strict=False)]
         moved = MOVES[name](*places, **without_sharding(params))
         whole = sp.csr_array(sp.vstack([x.on for x in xs]))
         return [_taken(whole, at.ravel()) for at in (moved if isinstance(moved, list) else [moved])]

@@ -9,7 +9,7 @@ import jax.lax as lax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Inexact
 
 from .._constants import MAX_UNROLLED_SUM, NUM_REFINEMENTS, REGULARISATION_POWER, TOLERANCE_IN_EPS
 from .._tree import eps_of
@@ -17,7 +17,7 @@ from .._tree import eps_of
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
 
 
-def lu_factors(matrix: Float[Array, "m m"]) -> tuple[Array, Array]:
+def lu_factors(matrix: Inexact[Array, "m m"]) -> tuple[Array, Array]:
     """`L` and `U` in one matrix, and the permutation of the rows. `jax.scipy.linalg` keeps the
     pivots instead, and each of its solves finds the permutation again, by a loop."""
     factors, _, permutation = lax.linalg.lu(matrix)
