@@ -813,6 +813,13 @@ class _IndexOneEquations(eqx.Module):
                 "`dae.wrap(solver)` of the same `dae` to `diffeqsolve`."
             )
 
+    def first_slopes(self, t: RealScalarLike, y: Y, args: Args) -> Array | None:
+        """The slopes at which the first Jacobian of a solve is computed, if it depends on them."""
+        given = _at(self.dae, t, y, args)
+        if given[0].is_linear:
+            return None
+        return _value(Reduction.all_slopes, self.dae, given, args)
+
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
         given = _at(self.dae, t, y, args)
         return _value(Reduction.index_one_equations, self.dae, given, args, ravel(slopes))

@@ -54,10 +54,11 @@ class Round(NamedTuple):
 
 class Blocks(NamedTuple):
     """Square systems of one size that do not depend on each other: a row of equations and of slopes
-    for each."""
+    for each, in which they may be linear."""
 
     equations: tuple[tuple[int, ...], ...]
     slopes: tuple[tuple[int, ...], ...]
+    is_linear: bool = True
 
 
 class SparseMatrix:
@@ -107,7 +108,6 @@ class Elimination:
 
     constant: SparseMatrix | None = None
     blocks: tuple[Blocks, ...] = ()
-    is_linear: bool = True
     as_given: bool = False
 
     def slopes(
@@ -118,8 +118,8 @@ class Elimination:
         if self.constant is not None:
             slopes = self.constant @ equations(slopes)
         for one in self.blocks:
-            rows, columns = (np.array(x, int) for x in one)
-            solve = _linear_blocks if self.is_linear else _nonlinear_block
+            rows, columns = np.array(one.equations, int), np.array(one.slopes, int)
+            solve = _linear_blocks if one.is_linear else _nonlinear_blocks
             slopes = slopes.at[columns].set(solve(equations, slopes, rows, columns))
         return slopes
 
@@ -145,12 +145,13 @@ def _solved(matrix: Float[Array, "b k k"], b: Float[Array, "b k"]) -> Float[Arra
     return jax.vmap(solve_equilibrated)(matrix, b)
 
 
-def _nonlinear_block(
+def _nonlinear_blocks(
     equations: Callable[[Array], Array], slopes: Float[Array, " n"], rows: Any, columns: Any
-) -> Float[Array, "1 k"]:
-    residual = lambda some: equations(slopes.at[columns[0]].set(some))[rows[0]]  # noqa: E731
+) -> Float[Array, "b k"]:
+    residual = lambda x: equations(slopes.at[columns.ravel()].set(x))[rows.ravel()]  # noqa: E731
     begin = jnp.zeros(columns.size, slopes.dtype)
-    return root(residual, ft.partial(algebraic_newton, residual), begin, solve_equilibrated).y[None]
+    found = root(residual, ft.partial(algebraic_newton, residual), begin, solve_equilibrated)
+    return found.y.reshape(columns.shape)
 
 
 def elimination(
@@ -159,16 +160,17 @@ def elimination(
     needed: Bool[np.ndarray, " n"],
     differentiated: Any,
     *,
-    is_linear: bool,
+    is_linear: Callable[[np.ndarray, np.ndarray], bool],
     mass: sp.csr_array | None,
     is_large: bool = False,
 ) -> Elimination:
     """How the needed ones of the slopes that are selected follow from equations that depend on the
-    slopes in these `places`. Those that are not `differentiated` may have a constant `mass`. What
-    would cost too much in a large system raises `NotFound`."""
+    slopes in these `places`. Those that are not `differentiated` may have a constant `mass`;
+    `is_linear` tells of some of the equations and slopes whether they are. What would cost too much
+    in a large system raises `NotFound`."""
     rows, columns = (np.array(x, int) for x in selected)
     closed = np.zeros(0, int), np.zeros(0, int)
-    if mass is not None and is_linear:
+    if mass is not None:
         closed = _closed(mass, np.setdiff1d(rows, differentiated), columns)
     at = np.isin(rows, closed[0]), np.isin(columns, closed[1])
     rows, columns = rows[~at[0]], columns[~at[1]]
@@ -176,13 +178,16 @@ def elimination(
     depends = places[rows][:, columns]  # each slope on others, by its own equation
     wanted = _reachable(depends, needed[columns])
     rows, columns, depends = rows[wanted], columns[wanted], depends[wanted][:, wanted]
-    blocks = _blocks(rows, columns, depends, together=not is_linear, is_large=is_large)
+    blocks = tuple(
+        one._replace(is_linear=is_linear(*(np.unique(x) for x in one[:2])))
+        for one in _blocks(rows, columns, depends, is_large)
+    )
     used = places[rows]
     needed = needed | (np.bincount(used.indices, minlength=needed.size) > 0)
     constant = None
     if mass is not None and (those := np.intersect1d(closed[1], np.flatnonzero(needed))).size:
         constant = _inverse(mass, closed, those, is_large)
-    return Elimination(constant, blocks, is_linear, not np.isin(rows, differentiated).any())
+    return Elimination(constant, blocks, not np.isin(rows, differentiated).any())
 
 
 def _reachable(depends: sp.csr_array, start: Bool[np.ndarray, " k"]) -> Bool[np.ndarray, " k"]:
@@ -196,7 +201,7 @@ def _reachable(depends: sp.csr_array, start: Bool[np.ndarray, " k"]) -> Bool[np.
 
 
 def _blocks(
-    rows: np.ndarray, columns: np.ndarray, depends: sp.csr_array, *, together: bool, is_large: bool
+    rows: np.ndarray, columns: np.ndarray, depends: sp.csr_array, is_large: bool
 ) -> tuple[Blocks, ...]:
     """The blocks in their order: slopes that depend on each other are in one."""
     if not columns.size:
@@ -214,7 +219,7 @@ def _blocks(
     sizes = np.bincount(block, minlength=count)
     if is_large and (not settled or sizes.max() > _MOST_COUPLED):
         raise NotFound("slopes that a constraint needs are coupled, and not by constants")
-    if together or not settled:
+    if not settled:
         return (Blocks((tuple(rows.tolist()),), (tuple(columns.tolist()),)),)
     order, found = np.argsort(block, kind="stable"), []
     starts = np.cumsum(sizes) - sizes

@@ -137,7 +137,13 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
         check_state(y0, kind=jnp.inexact)
         refuse_half_precision("`Radau`", y0)
         y = ravel(y0)
-        return _Last(jnp.zeros((3, y.size), y.dtype), jnp.asarray(jnp.abs(t1 - t0), y.dtype))
+        terms, t0, t1 = in_field_time(terms, t0, t1)
+        length = nonzero_length(t0, t1).astype(y.dtype)
+        slopes = None if self._equations is None else self._equations.first_slopes(t0, y0, args)
+        coefficients = jnp.zeros((3, y.size), y.dtype)
+        if slopes is not None:
+            coefficients = coefficients.at[0].set(length * slopes)
+        return lax.stop_gradient(_Last(coefficients, length))
 
     def step(
         self,

@@ -298,8 +298,8 @@ class Reduction:
     def _by_slopes(self, t: Array, y: Array) -> Float[Array, "n n"]:
         slopes = jnp.zeros_like(y)
         if not self.structure.is_linear:
-            selected = Blocks(*((x,) for x in self.structure.rounds[0]))
-            together = Elimination(blocks=(selected,), is_linear=False)
+            selected = Blocks(*((x,) for x in self.structure.rounds[0]), is_linear=False)
+            together = Elimination(blocks=(selected,))
             slopes = together.slopes(ft.partial(self.equations, t, y), y)
         return jax.jacfwd(self.equations, 2)(t, y, slopes)
 
@@ -386,6 +386,8 @@ def find_structure(
         y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
     )
     find = FindPlaces(numbers, unknown, t, y)
+    by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
+    eliminated = ft.partial(_with_elimination, ft.partial(_is_linear, by_slopes, t, y))
     places = find.dense(equations, 2, y.size)
     new_unknowns, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
@@ -395,7 +397,7 @@ def find_structure(
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         needed = np.any(places[list(left)], axis=0)
-        structure = _with_elimination(structure, places, selected, needed)
+        structure = eliminated(structure, places, selected, needed)
         by_y, by_slope = _derivatives(equations, structure, numbers, t, y)
         by_slope = np.where(matrix == 0, 0, by_slope)
         with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
@@ -414,12 +416,32 @@ def find_structure(
         places = places.copy()
         places[list(left)] = find.dense(last, 1, len(left))
     every = tuple(range(y.size))
-    structure = _with_elimination(structure, places, Round(every, every), np.full(y.size, True))
+    structure = eliminated(structure, places, Round(every, every), np.full(y.size, True))
     found = new_unknowns if all(met) else []
     return _with_unknowns(structure, gradients, computed, given, found)
 
 
+def _is_linear(
+    by_slopes: Callable[[Array], Array],
+    t: Array,
+    y: Array,
+    structure: Structure,
+    rows: np.ndarray,
+    columns: np.ndarray,
+) -> bool:
+    """Whether some of the equations are linear in some of the slopes, whatever the others are.
+    Those that are differentiated are."""
+    if structure.is_linear:
+        return True
+    given = np.setdiff1d(rows, structure.left(0) if structure.rounds else ())
+    _, _, (slopes, others) = general_states(t, y, 0.0)
+    moved = jnp.where(np.isin(np.arange(y.size), columns), others, slopes)
+    both = (np.asarray(by_slopes(x))[np.ix_(given, columns)] for x in (slopes, moved))
+    return np.array_equal(*both, equal_nan=False)
+
+
 def _with_elimination(
+    is_linear: Callable[[Structure, np.ndarray, np.ndarray], bool],
     structure: Structure,
     places: Bool[np.ndarray, "n n"],
     selected: Round,
@@ -434,7 +456,7 @@ def _with_elimination(
             selected,
             needed,
             structure.left(0) if structure.rounds else (),
-            is_linear=structure.is_linear,
+            is_linear=ft.partial(is_linear, structure),
             mass=None if mass is None else sp.csr_array(mass),
         )
     return dataclasses.replace(structure, eliminations=(*structure.eliminations, found))

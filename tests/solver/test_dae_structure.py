@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_conserve as dfc
-from diffrax_conserve._dae.dae import _structure
+from diffrax_conserve._dae.dae import _Constraints, _structure
 
 from ..problems import EPS, refused
 
@@ -132,6 +132,40 @@ def test_hidden_constraints_solve_for_one_slope_at_a_time():
     solved = [[np.shape(one.slopes) for one in found.blocks] for found in others]
     assert solved == [[(9, 1)], [(12, 1)]]
     assert sum(map(np.prod, (np.shape(one.slopes) for one in last.blocks))) == 35
+
+
+@pytest.mark.parametrize("power", [1, 3])
+def test_linear_in_the_slopes_that_are_not_known_yet(power):
+    """Lagrange's equations may be written with slopes in the place of velocities: in the
+    accelerations they are linear. Not so, if they contain a power of these."""
+
+    def residual(named):
+        def equations(t, y, dy, args):
+            (q, v, force), (dq, dv, _) = y, dy
+            speed = dq if named else v
+            push = force * jnp.stack([jnp.ones(()), -2 * q[1]])
+            inertia = dv**power + (1 + q**2) * dv
+            return dq - v, inertia + q * speed[::-1] ** 2 - push, q[0] - q[1] ** 2 - 1
+
+        return dfc.DAE(residual=equations)
+
+    state = jnp.array([1.25, 0.5]), jnp.array([0.3, 0.3]), jnp.array(0.0)
+    found = [_structure(residual(named), 0.0, state, None) for named in (True, False)]
+    assert found[0].index == 3
+    assert found[0].rounds == found[1].rounds
+    for structure in found:
+        linear = [[x.is_linear for x in one.blocks] for one in structure.eliminations if one]
+        assert all(map(all, linear)) == (power == 1)
+    constraints = [_Constraints(residual(named))(0.0, state, None) for named in (True, False)]
+    for a, b in zip(*constraints, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+    q, v, force = residual(True).consistent(state)
+    slope = residual(True).term.vf(0.0, (q, v, force), None)
+    push = force * np.array([1.0, -2 * q[1]])
+    np.testing.assert_allclose(
+        slope[1] ** power + (1 + q**2) * slope[1] + q * v[::-1] ** 2, push, rtol=1e-12, atol=1e-12
+    )
+    np.testing.assert_allclose(slope[1][0], 2 * (v[1] ** 2 + q[1] * slope[1][1]), rtol=1e-11)
 
 
 def test_integers_in_args_may_change():
