@@ -35,8 +35,8 @@ from .._numerics.implicit import AbstractSystem, implicit_solution
 from .._numerics.iterate import Solved, iterate, remaining_after_test
 from .._numerics.lanes import where_active
 from .._numerics.problem import Problem
-from .._numerics.rows import DenseRows
-from .._tree import tree_stop_gradient
+from .._numerics.rows import AbstractRows, DenseRows
+from .._tree import eps_of, tree_stop_gradient
 from .elimination import SparseMatrix
 from .newton import solve_equilibrated
 
@@ -62,8 +62,9 @@ def nearest_with_free(
     - `fixed`: the unknowns that stay as they are.
     """
     fixed = np.zeros(candidate.size, bool) if fixed is None else fixed
-    units = jnp.where(fixed, 0, units.at[free].set(0))
     problem_at, at, units = tree_stop_gradient((problem, candidate, units))
+    units = _positive(units.at[free].set(0), problem_at.linearise(at)[1])
+    units = jnp.where(fixed, 0, units.at[free].set(0))
     found = None
     if isinstance(along, SparseMatrix):
         along = SparseMatrix(along.matrix[:, ~(abs(along.matrix.T) @ fixed).astype(bool)])
@@ -77,6 +78,17 @@ def nearest_with_free(
         moves = moves if by_free is None else moves & by_free
         corrections = _DenseCorrections.at(problem_at, at, units, moves, along)
     return implicit_solution(_Nearest(problem, candidate, corrections, max_steps=max_steps))
+
+
+def _positive(units: Float[Array, " n"], jacobian: AbstractRows) -> Float[Array, " n"]:
+    """The units, where they are zero by a small share of what others stand for in the constraints.
+
+    An unknown that has not moved so far has none, such as a virtual ground, whose voltage is zero.
+    Its constraint could not be told from that of another unknown if it stayed where it is."""
+    largest = jacobian.scale_columns(units).largest_in_rows()
+    column = jacobian.divide_rows(jnp.where(largest > 0, largest, 1)).largest_in_columns()
+    share = eps_of(units) ** 0.25 / jnp.where(column > 0, column, 1)
+    return jnp.where(units == 0, share, units)
 
 
 class _Nearest(AbstractSystem):

@@ -1,4 +1,5 @@
-"""Rectifiers of textbooks, as the nodal analysis states them, beside scipy on reduced equations."""
+"""Circuits of textbooks, as the nodal analysis states them, beside scipy on reduced equations, and
+exact solutions."""
 
 import functools as ft
 
@@ -99,3 +100,42 @@ def test_diodes_that_block_leave_no_current_but_roundoff():
         exact = solve_ivp(slope, (0, time), [0.0], "Radau", **options).y[0, -1]
     np.testing.assert_allclose(y[2], exact, rtol=1e-5)
     np.testing.assert_allclose(y[0] - y[1], source(time), rtol=1e-12)
+
+
+def test_a_virtual_ground_has_not_moved():
+    """A differentiator by an ideal amplifier, whose input is at a voltage of zero all the time: an
+    unknown that has no size. Its transient ends within microseconds."""
+    into, feedback, resistance, omega = 1e-6, 1e-9, 1e3, 1e3
+
+    def residual(t, y, slopes, args):
+        v_in, ground, v_out, i_in, i_out = y
+        charging, back = into * (slopes[0] - slopes[1]), feedback * (slopes[2] - slopes[1])
+        through = back + (v_out - ground) / resistance
+        source, load = v_in - jnp.sin(omega * t), v_out / 1e4
+        return jnp.stack(
+            [i_in + charging, charging + through, i_out + through + load, source, ground]
+        )
+
+    dae, time = dfc.DAE(residual=residual), 1e-2
+    y, result, _ = solve(dae, dae.consistent(jnp.zeros(5)), time, jnp.array(1e-6))
+    assert result == dfx.RESULTS.successful
+    rate, angle = 1 / (resistance * feedback), omega * time
+    wave = rate * np.cos(angle) + omega * np.sin(angle)
+    v_out = -into / feedback * omega * wave / (rate**2 + omega**2)
+    np.testing.assert_allclose(y[2], v_out, rtol=1e-6)
+    assert abs(y[1]) < 1e-15
+
+
+def test_an_output_of_a_nonlinear_slope():
+    """`y = p³ + p`, `p = y'`: `3/2 p² + log p - t` is constant. A first Jacobian at slopes of zero
+    would be a third of that at the slope, at which Newton's method diverges in any step."""
+
+    def residual(t, y, slopes, args):
+        return jnp.stack([slopes[0] ** 3 + slopes[0] - y[0], y[1] - slopes[0]])
+
+    dae = dfc.DAE(residual=residual)
+    y0 = dae.consistent(jnp.array([2.0, 0.5]))
+    np.testing.assert_allclose(y0, [2.0, 1.0], rtol=1e-14)
+    (_, p), result, _ = solve(dae, y0, 1.0, jnp.array(1e-3))
+    assert result == dfx.RESULTS.successful
+    np.testing.assert_allclose(1.5 * p**2 + np.log(p), 2.5, rtol=1e-6)
