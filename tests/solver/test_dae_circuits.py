@@ -30,7 +30,7 @@ def diode(voltage, module=jnp):
 def solve(dae, y0, time, dt0, dtmax=None, tol=1e-6):
     """The last state, the result, and how many steps were rejected."""
     steps = dfx.PIDController(rtol=tol, atol=tol, dtmax=dtmax)
-    options = TO_THE_END | dict(stepsize_controller=steps)
+    options = TO_THE_END | dict(stepsize_controller=steps, max_steps=4096)
     solver = dae.wrap(dfc.Radau())
     found = dfx.diffeqsolve(dae.term, solver, 0.0, time, dt0, y0, **options)
     return found.ys[-1], found.result, found.stats["num_rejected_steps"]
