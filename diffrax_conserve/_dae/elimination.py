@@ -32,11 +32,13 @@ from scipy.sparse.csgraph import (
 
 from .._large.elimination import combinations
 from .._numerics.implicit import root
-from .newton import algebraic_newton, solve_equilibrated
+from .newton import algebraic_newton, row_and_column_scales, solve_equilibrated
 
-# In a large system at most so many slopes are solved for together. A matrix of eliminated slopes
-# with more elements for each row is given up: each constraint would contain so many unknowns.
-_MOST_COUPLED = 64
+# In a large system at most so many slopes are solved for together.
+_MOST_COUPLED = 6
+# A matrix of eliminated slopes with more than this many elements for each row is given up: each
+# constraint would contain so many unknowns.
+_MOST_TERMS = 64
 # So many blocks are solved one after the other. In a small system the rest is one block.
 _MOST_LEVELS = 8
 
@@ -135,14 +137,26 @@ def _linear_blocks(
 
 
 def _solved(matrix: Float[Array, "b k k"], b: Float[Array, "b k"]) -> Float[Array, "b k"]:
-    """`matrix⁻¹ b`. For one and two unknowns that is written out, as a call of LAPACK is not."""
-    if b.shape[1] == 1:
+    """`matrix⁻¹ b`, for several blocks by elimination that is written out: XLA spreads the calls of
+    LAPACK for a batch over its threads, where on two cores some waited for each other for ever."""
+    if len(b) == 1:
+        return solve_equilibrated(matrix[0], b[0])[None]
+    size = b.shape[1]
+    if size == 1:
         return b / matrix[:, 0]
-    if b.shape[1] == 2:
-        p, q, r, s = (matrix[:, i, j] for i in (0, 1) for j in (0, 1))
-        top = jnp.stack([s * b[:, 0] - q * b[:, 1], p * b[:, 1] - r * b[:, 0]], axis=1)
-        return top / (p * s - q * r)[:, None]
-    return jax.vmap(solve_equilibrated)(matrix, b)
+    scales = jax.vmap(row_and_column_scales)(matrix)
+    rows, columns = lax.stop_gradient(scales)
+    scaled = jnp.concatenate([matrix / columns[:, None], b[..., None]], 2) / rows[..., None]
+    lines = [*jnp.unstack(scaled, axis=1)]
+    for k in range(size):
+        for i in range(k + 1, size):
+            exchanged = (jnp.abs(lines[i]) > jnp.abs(lines[k]))[:, k, None]
+            pair = lines[k], lines[i]
+            lines[k], lines[i] = (jnp.where(exchanged, *x) for x in (pair[::-1], pair))
+        for i in range(size):
+            if i != k:
+                lines[i] = lines[i] - (lines[i][:, k] / lines[k][:, k])[:, None] * lines[k]
+    return jnp.stack([x[:, -1] / x[:, k] for k, x in enumerate(lines)], axis=1) / columns
 
 
 def _nonlinear_blocks(
@@ -226,7 +240,8 @@ def _blocks(
     for one, size in np.unique(np.stack([level, sizes], 1), axis=0):
         those = np.flatnonzero((level == one) & (sizes == size))
         at = order[starts[those][:, None] + np.arange(size)]
-        found.append(Blocks(*(tuple(map(tuple, x[at].tolist())) for x in (rows, columns))))
+        for part in [at] if size <= _MOST_COUPLED else at[:, None]:
+            found.append(Blocks(*(tuple(map(tuple, x[part].tolist())) for x in (rows, columns))))
     return tuple(found)
 
 
@@ -252,7 +267,7 @@ def _inverse(
     at = np.argsort(columns)[np.searchsorted(np.sort(columns), needed)]
     one = sp.csr_array((np.ones(len(at)), (np.arange(len(at)), at)), (len(at), len(columns)))
     inverse = sp.coo_array(combinations(one, mass[rows][:, columns]))
-    if is_large and inverse.nnz > _MOST_COUPLED * len(at):
+    if is_large and inverse.nnz > _MOST_TERMS * len(at):
         raise NotFound(
             "the slopes of too many unknowns are coupled, as those of finite elements with a "
             "consistent mass matrix: use a diagonal one"

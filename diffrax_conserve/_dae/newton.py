@@ -33,12 +33,12 @@ def solve_equilibrated(
     default from all."""
     if len(b) == 1:
         return b / matrix[0]
-    rows, columns = lax.stop_gradient(_row_and_column_scales(matrix, leading))
+    rows, columns = lax.stop_gradient(row_and_column_scales(matrix, leading))
     scaled = matrix / rows[:, None] / columns
     return (jnp.linalg.solve(scaled, (b.T / rows).T).T / columns).T
 
 
-def _row_and_column_scales(
+def row_and_column_scales(
     jacobian: Float[Array, "m m"], leading: Bool[Array, " m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """The units of equations and unknowns, in which no entry is larger than one."""
@@ -63,7 +63,7 @@ class _Factored(NamedTuple):
     @classmethod
     def at(cls, residual: Residual, z: Float[Array, " m"]) -> "_Factored":
         jacobian = jax.jacfwd(residual)(z)
-        rows, columns = _row_and_column_scales(jacobian)
+        rows, columns = row_and_column_scales(jacobian)
         scaled = jacobian / rows[:, None] / columns
         one = scaled, jnp.zeros(1, jnp.int32)
         return cls(one if rows.size == 1 else lu_factors(scaled), rows, columns, jacobian)
