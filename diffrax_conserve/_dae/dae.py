@@ -36,9 +36,8 @@ from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
 from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
+from .elimination import NotFound, SparseMatrix
 from .free_unknowns import nearest_with_free
-from .large import SparseMatrix
-from .large_search import NotFound
 from .newton import (
     MAX_NEWTON_STEPS,
     SparseNewton,
@@ -674,11 +673,11 @@ class ConstraintProjection(AbstractProjection):
             y, info = SimplifiedNewton().solve(dataclasses.replace(problem, factor=free), candidate)
             length = lax.stop_gradient(metric.norm(y - candidate))
             return y, dataclasses.replace(info, correction=length)
-        y, converged = _solved_for(self.dae, problem.t, state, problem.args, error_oriented_newton)
+        y, is_root = _solved_for(self.dae, problem.t, state, problem.args, error_oriented_newton)
         # Where a force is large and the unknowns beside it are small, as a voltage is when it
         # changes its sign, the residual does not go below the roundoff of the force, which the
-        # scale does not contain. Corrections that have converged tell more.
-        return y, problem.report(candidate, y, converged=converged)
+        # scale does not contain. Newton's method tells more.
+        return y, problem.report(candidate, y, converged=is_root)
 
 
 @ft.partial(RunOnce, eqx.filter_jit)
@@ -745,7 +744,7 @@ def _solved_for(
     dae: DAE, t: RealScalarLike, state: Y, args: Args, newton: Callable[..., Solved]
 ) -> tuple[Float[Array, " n"], Bool[Array, ""]]:
     """The state of equations of index 1, moved without what they differentiate, NaN if Newton's
-    method finds none; and whether its corrections have converged."""
+    method finds none; and whether that is a root."""
     structure, t, state = _at(dae, t, state, args)
     y = ravel(state)
     reduction = Reduction(structure, dae._equations(t, state, args), t, y)

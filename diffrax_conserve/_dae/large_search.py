@@ -77,7 +77,7 @@ def find_large_structure(
         return Large(places.of(equations, 1), given)
 
     n = y.size
-    places = FindPlaces(numbers, unknown, t, y)
+    places = FindPlaces(memory, numbers, unknown, t, y)
     large = once("places", found)
     by_y, by_slope = large.by_y, large.by_slope
     t, y, of_y, values, is_linear, absent = _general_position(
@@ -128,7 +128,7 @@ def find_large_structure(
             new = exact_sum(share @ of_y, abs(share) @ abs(of_y))
         else:
             last = LastConstraints(equations, structure)
-            at = once(last, ft.partial(places.of, last, 1))
+            at = places.of(last, 1)
             new = _matrix(at, _last_values(last, at, numbers, t, y))
         contained = ~_empty(new, 0)
         new_unknowns.append(np.flatnonzero(contained & ~seen))
@@ -237,8 +237,8 @@ def _with_round(
             )
         left = np.setdiff1d(np.arange(n), rows)
         share = combinations(structure.mass[left][:, columns], structure.mass[rows][:, columns])
-        whole = _spread(sp.eye_array(len(left), format="csr"), None, left, n)
-        whole = whole - _spread(share, None, rows, n)
+        whole = _spread(sp.eye_array(len(left), format="csr"), left, n)
+        whole = whole - _spread(share, rows, n)
         return dataclasses.replace(large, combinations=SparseMatrix(whole)), None
     if needed.size and not structure.is_linear:
         raise NotFound("they are not linear in slopes that a constraint needs")
@@ -280,18 +280,15 @@ def _along(
         if not constant:
             return None
         share = combinations(sp.csr_array(outer.T), sp.csr_array(matrix[rows][:, columns].T))
-        basis = basis - _spread(share, None, columns, n).T
+        basis = basis - _spread(share, columns, n).T
     return SparseMatrix(sp.csr_array(basis))
 
 
-def _spread(
-    matrix: sp.csr_array, rows: np.ndarray | None, columns: np.ndarray, size: int
-) -> sp.csr_array:
-    """The matrix with its lines in these places of a larger one."""
+def _spread(matrix: sp.csr_array, columns: np.ndarray, size: int) -> sp.csr_array:
+    """The matrix with its columns in these places of a wider one."""
     at = sp.coo_array(matrix)
-    row = at.coords[0] if rows is None else rows[at.coords[0]]
-    shape = matrix.shape[0] if rows is None else size
-    return sp.csr_array((at.data, (row, columns[at.coords[1]])), (shape, size))
+    row, column = at.coords
+    return sp.csr_array((at.data, (row, columns[column])), (matrix.shape[0], size))
 
 
 # ---- Numbers ----

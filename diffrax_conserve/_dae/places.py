@@ -14,14 +14,27 @@ Numbers = list[Array | np.ndarray | np.generic]
 
 class FindPlaces:
     """Finds where derivatives have elements, whatever the unknown numbers, the time and the state
-    are."""
+    are. So it is remembered for the next search of the same equations."""
 
-    def __init__(self, numbers: Numbers, unknown: tuple[int, ...], t: Array, y: Array):
-        self.numbers, self.unknown = numbers, unknown
+    def __init__(
+        self, memory: dict[Any, Any], numbers: Numbers, unknown: tuple[int, ...], t: Array, y: Array
+    ):
+        self.memory, self.numbers, self.unknown = memory, numbers, unknown
         self.time, self.zeros = np.zeros_like(t), np.zeros_like(y)
 
     def of(self, fn: Any, argument: int) -> SparseJacobian:
-        """Of `fn(numbers, t, y, slopes)` by `y` or by `slopes`."""
+        """Of `fn(numbers, t, y, slopes)` by `y` or by `slopes`; raises `NotSparse`."""
+        key = fn, argument
+        if key not in self.memory:
+            try:
+                self.memory[key] = self._found(fn, argument)
+            except NotSparse:
+                self.memory[key] = None
+        if self.memory[key] is None:
+            raise NotSparse
+        return self.memory[key]
+
+    def _found(self, fn: Any, argument: int) -> SparseJacobian:
 
         def of_one(x: Array, t: Array, other: Array, *others: Array) -> Array:
             numbers = [*self.numbers]

@@ -41,6 +41,8 @@ from .places import FindPlaces, Numbers
 # `F(t, y, y')` as a function of a time and two vectors.
 Implicit = Callable[[Array, Array, Array], Array]
 
+_NO_ROUND = Round((), ())  # nothing is solved yet
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Structure:
@@ -365,12 +367,13 @@ def find_structure(
     y: Array,
     mass: np.ndarray | None,
     unknown: tuple[int, ...],
+    memory: dict[Any, Any],
     known: Structure | None = None,
 ) -> Structure:
     """The structure of equations with these numbers near a state, by elimination. Whether `∂F/∂y'`
-    is constant, the other numbers tell. `unknown` are the numbers that may have any values. While
-    the ranks are those of a known structure, what that selects is taken, for which the programs are
-    compiled."""
+    is constant, the other numbers tell. `unknown` are the numbers that may have any values;
+    `memory` holds what does not depend on them, for the next search. While the ranks are those of
+    a known structure, what that selects is taken, for which the programs are compiled."""
     t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
@@ -385,7 +388,7 @@ def find_structure(
     structure = Structure(
         y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
     )
-    find = FindPlaces(numbers, unknown, t, y)
+    find = FindPlaces(memory, numbers, unknown, t, y)
     by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
     eliminated = ft.partial(_with_elimination, ft.partial(_is_linear, by_slopes, t, y))
     places = find.dense(equations, 2, y.size)
@@ -501,9 +504,6 @@ def _with_unknowns(
         by_free=by_free if must_know else None,
         new_unknowns=tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns),
     )
-
-
-_NO_ROUND = Round((), ())
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.

@@ -118,7 +118,7 @@ class Search:
             if y.size > MOST_DENSE:
                 raise
         dense = None if mass is None else mass.toarray()
-        return find_structure(*given, dense, self._unknown, known)
+        return find_structure(*given, dense, self._unknown, self._memory, known)
 
 
 def _large_structure(equations: Any, numbers: Any, others: Any, t: Any, y: Any, *more: Any) -> Any:

@@ -4,6 +4,7 @@ that dense matrices find where these do, and have the numbers that are known by 
 import time
 
 import diffrax as dfx
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -335,18 +336,20 @@ def test_what_is_not_found_is_refused_at_once():
     assert time.monotonic() - begin < 60
 
 
+@eqx.filter_jit
+def end(dae, y0, time, dt0, steps):
+    """The last state of a solve."""
+    options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode())
+    found = dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, time, dt0, y0, **options)
+    return jax.tree.map(lambda y: y[-1], found.ys)
+
+
 def test_bodies_with_coupled_slopes():
     """A row of 25 carts, with 124 unknowns, is one body with as many pendulums."""
     n, time = 25, 1.0
     dae, guess = carts(n)
     steps = dfx.PIDController(rtol=1e-7, atol=1e-7)
-
-    @jax.jit
-    def end(y0):
-        options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode())
-        return dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, time, 1e-3, y0, **options).ys
-
-    x, angles, *_ = jax.tree.map(lambda y: y[-1], end(dae.consistent(*guess)))
+    x, angles, *_ = end(dae, dae.consistent(*guess), time, 1e-3, steps)
 
     def slopes(t, y):
         (place, speed), (angle, w) = y[:2], np.split(y[2:], 2)
@@ -368,16 +371,8 @@ def test_a_large_solve_is_that_of_scipy(monkeypatch):
         monkeypatch.setattr(module, "MIN_KLU", 20)
     n, t1 = 24, 0.1
     dae, guess = heat(n)
-    steps = dfx.PIDController(rtol=1e-6, atol=1e-8)
-
-    @jax.jit
-    def end(y0):
-        options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode())
-        sol = dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, t1, 1e-4, y0, **options)
-        return sol.ys[-1]
-
     y0 = dae.consistent(*guess)
-    y = np.asarray(end(y0))
+    y = np.asarray(end(dae, y0, t1, 1e-4, dfx.PIDController(rtol=1e-6, atol=1e-8)))
 
     def slope(t, u):
         whole = np.concatenate([[1 + np.sin(t)], u, u[-1:] ** 3])
