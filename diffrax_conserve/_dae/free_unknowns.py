@@ -35,7 +35,7 @@ from .._numerics.implicit import AbstractSystem, implicit_solution
 from .._numerics.iterate import Solved, iterate, remaining_after_test
 from .._numerics.lanes import where_active
 from .._numerics.problem import Problem
-from .._numerics.rows import AbstractRows, DenseRows
+from .._numerics.rows import DenseRows
 from .._tree import eps_of, tree_stop_gradient
 from .elimination import SparseMatrix
 from .newton import solve_equilibrated
@@ -63,32 +63,30 @@ def nearest_with_free(
     """
     fixed = np.zeros(candidate.size, bool) if fixed is None else fixed
     problem_at, at, units = tree_stop_gradient((problem, candidate, units))
-    units = _positive(units.at[free].set(0), problem_at.linearise(at)[1])
-    units = jnp.where(fixed, 0, units.at[free].set(0))
+    moving = ~fixed & ~np.isin(np.arange(candidate.size), free)
+    units = jnp.where(moving, units, 0)
     found = None
     if isinstance(along, SparseMatrix):
         along = SparseMatrix(along.matrix[:, ~(abs(along.matrix.T) @ fixed).astype(bool)])
         found = sparse_jacobian(problem.residual, candidate)
     if isinstance(along, SparseMatrix) and found is not None:
-        places = _Places(found, along, free, fixed)
+        places = _Places(found, along, moving)
         corrections: Any = _SparseCorrections.at(problem_at, at, units, places)
     else:
         along = along.dense(candidate.dtype) if isinstance(along, SparseMatrix) else along
         moves = ~jnp.any((along != 0) & fixed[:, None], 0)
         moves = moves if by_free is None else moves & by_free
-        corrections = _DenseCorrections.at(problem_at, at, units, moves, along)
+        corrections = _DenseCorrections.at(problem_at, at, units, moving, moves, along)
     return implicit_solution(_Nearest(problem, candidate, corrections, max_steps=max_steps))
 
 
-def _positive(units: Float[Array, " n"], jacobian: AbstractRows) -> Float[Array, " n"]:
-    """The units, where they are zero by a small share of what others stand for in the constraints.
+def _positive(units: Float[Array, " n"], moving: Any, columns: Float[Array, " n"]) -> Array:
+    """The units, where they are zero by a small share of what others stand for in the constraints,
+    of which `columns` are the largest elements of the Jacobian, as shares of those in their rows.
 
     An unknown that has not moved so far has none, such as a virtual ground, whose voltage is zero.
     Its constraint could not be told from that of another unknown if it stayed where it is."""
-    largest = jacobian.scale_columns(units).largest_in_rows()
-    column = jacobian.divide_rows(jnp.where(largest > 0, largest, 1)).largest_in_columns()
-    share = eps_of(units) ** 0.25 / jnp.where(column > 0, column, 1)
-    return jnp.where(units == 0, share, units)
+    return jnp.where((units == 0) & moving, eps_of(units) ** 0.25 / columns, units)
 
 
 class _Nearest(AbstractSystem):
@@ -135,9 +133,17 @@ class _DenseCorrections(eqx.Module):
 
     @classmethod
     def at(
-        cls, problem: Problem, candidate: Array, units: Array, moves: Any, along: Array
+        cls,
+        problem: Problem,
+        candidate: Array,
+        units: Array,
+        moving: Any,
+        moves: Any,
+        along: Array,
     ) -> "_DenseCorrections":
         jacobian = cls.linearise(problem, candidate)[1].matrix
+        columns = _largest(jacobian / _largest(jacobian * units, 1), 0)[0]
+        units = _positive(units, moving, columns)
         return cls(lax.stop_gradient(_directions(jacobian, units, along, moves)))
 
     @staticmethod
@@ -200,14 +206,15 @@ class _Places:
     - `element`, `factor`, `row`, `column`: for each term of an element of `B` the element of `G`
       and the factor of `N` in it, and its place.
     - `wide`: the elements of `G` in the columns of `e`.
+    - `moving`: the unknowns that are neither free nor fixed.
     """
 
-    def __init__(self, found: SparseJacobian, along: SparseMatrix, free: np.ndarray, fixed: Any):
+    def __init__(self, found: SparseJacobian, along: SparseMatrix, moving: np.ndarray):
         self.found, self.along, (m, n), f = found, along, found.shape, along.shape[1]
+        self.moving = moving
         # The elements of `G` are in the order of the columns.
         counts = np.bincount(found.columns, minlength=n)
-        moves = ~np.isin(np.arange(n), free) & ~fixed
-        narrow, wide = moves & (counts <= _WIDE), moves & (counts > _WIDE)
+        narrow, wide = moving & (counts <= _WIDE), moving & (counts > _WIDE)
         first, place = _expanded(np.where(narrow, counts, 0)[found.columns])
         self.gram = first, (np.cumsum(counts) - counts)[found.columns[first]] + place
         basis = along.matrix
@@ -251,6 +258,13 @@ class _Sparse(NamedTuple):
         products = jnp.abs(self.values) * x[self.found.columns]
         return jax.ops.segment_sum(products, self.found.rows, self.found.shape[0])
 
+    def largest(self, axis: int) -> Array:
+        """The largest elements of the rows or columns, one where all are zero."""
+        zeros = jnp.zeros(self.found.shape[axis], self.values.dtype)
+        along = (self.found.rows, self.found.columns)[axis]
+        largest = zeros.at[along].max(jnp.abs(self.values))
+        return jnp.where(largest > 0, largest, 1)
+
 
 class _SparseCorrections(eqx.Module):
     """`jacobian` are the values of `G` at the candidate; `row` the units of the constraints;
@@ -268,6 +282,9 @@ class _SparseCorrections(eqx.Module):
     ) -> "_SparseCorrections":
         found, size = places.found, places.places.size
         values = found.values(problem.residual, candidate)
+        largest = _Sparse(jnp.abs(values) * units[found.columns], found).largest(0)
+        columns = _Sparse(values / largest[found.rows], found).largest(1)
+        units = _positive(units, places.moving, columns)
         by_e = jnp.abs(values) * units[found.columns]
         row = jnp.zeros(found.shape[0], values.dtype).at[found.rows].max(by_e)
         row = row.at[places.row].max(jnp.abs(values[places.element] * places.factor))
