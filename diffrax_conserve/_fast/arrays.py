@@ -388,7 +388,7 @@ class _Program:
         return self.reshaped(self.concatenated(parts, 0), operand.shape)
 
 
-def _is(x: _Value, number: float) -> bool:
+def _is(x: _Value, number: int) -> bool:
     return x.number is not None and bool(x.number == number)
 
 

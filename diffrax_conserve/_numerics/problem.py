@@ -33,7 +33,7 @@ from .._manifold import at_full_precision, entry_names, evaluate, is_entry
 from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
-from .rows import AbstractRows, DenseRows
+from .rows import AbstractRows, DenseRows, HasSizes
 from .sparse_rows import SparseRows
 
 # The status of a residual: infinite or NaN; beyond its tolerance; within it; noise. That of a state
@@ -147,7 +147,7 @@ class Problem(eqx.Module):
         """The same problem, with the Jacobian computed as a dense matrix."""
         return dataclasses.replace(self, pattern=None)
 
-    def scale(self, jacobian: AbstractRows, y: Float[Array, " n"]) -> Float[Array, " m"]:
+    def scale(self, jacobian: HasSizes, y: Float[Array, " n"]) -> Float[Array, " m"]:
         size = jnp.abs(y if self.clip is None else self.clip(y))
         size = size if self.changes is None else size + self.changes
         return self.magnitude + jacobian.absolute_matvec(size)

@@ -24,7 +24,7 @@ contradict each other. There are three ways to solve such a system.
 
 import abc
 from collections.abc import Callable
-from typing import Any, TypeVar, final
+from typing import Any, Protocol, TypeVar, final, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -50,6 +50,15 @@ from .linear import (
 )
 
 Rows = TypeVar("Rows", bound="AbstractRows")
+
+
+@runtime_checkable
+class HasSizes(Protocol):
+    """A matrix that knows how large the terms of its products are."""
+
+    def absolute_matvec(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """`|U| x`."""
+        ...
 
 
 class AbstractRows(eqx.Module):
