@@ -24,12 +24,12 @@ ROOT = Path(__file__).parents[1]
 LANES = 16
 
 
-def solve(y0):
+def solve(y0, **options):
     """Ten steps of Euler's method, the quickest to compile, for one rigid body."""
     system = dfc.systems.RigidBody()
     solver = dfc.ManifoldProjection(dfx.Euler(), system.manifold)
     term = dfx.ODETerm(system.vector_field)
-    return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y0).ys[-1]
+    return dfx.diffeqsolve(term, solver, 0.0, 1.0, 0.1, y0, **options).ys[-1]
 
 
 def spread_over_eight_devices():
@@ -87,6 +87,18 @@ def answer(devices, function):
     )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_solve_and_its_gradient_in_a_shard():
+    """There a trace has types of its own, which differ from those around it by their shardings."""
+    mesh, lanes = jax.make_mesh((1,), ("lanes",)), PartitionSpec("lanes")
+    y0s = jax.vmap(dfc.systems.RigidBody().sample)(jax.random.split(jax.random.key(0), 2))
+    options = {"adjoint": dfx.DirectAdjoint(), "max_steps": 16}
+    batched = jax.vmap(jax.value_and_grad(lambda y0: solve(y0, **options)[0]))
+    mapped = jax.shard_map(batched, mesh=mesh, in_specs=lanes, out_specs=lanes, check_vma=False)
+    spread = jax.device_put(y0s, NamedSharding(mesh, lanes))
+    for found, expected in zip(jax.jit(mapped)(spread), jax.jit(batched)(y0s), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-13)
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
 from .._tree import tree_tangents, unflatten
+from .closures import ClosureConverted
 from .iterate import Solved, simplified_newton
 from .problem import Problem
 from .rows import AbstractRows
@@ -204,7 +205,7 @@ def root(
     systems, where the matrix is `jacobian(residual)(unknowns)` with flat unknowns. The arrays over
     which the functions close, such as parameters, have their derivatives too. If nothing is found
     the derivative is that at the `fallback`, by default the guess."""
-    residual, iterate = (eqx.filter_closure_convert(fn, guess) for fn in (residual, iterate))
+    residual, iterate = (ClosureConverted(fn, guess) for fn in (residual, iterate))
     fallback = guess if fallback is None else fallback
     return implicit_solution(SquareSystem(residual, iterate, guess, fallback, solve, jacobian))
 

@@ -31,6 +31,7 @@ from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Value
 from .._large.sparse import Pattern, pattern_of
 from .._manifold import at_full_precision, entry_names, evaluate, is_entry
 from .._tree import eps_of, key_of, ravel, tree_stop_gradient, unflatten, unravel
+from .closures import ClosureConverted
 from .metric import AbstractFactor, Identity
 from .report import ProjectionInfo
 from .rows import AbstractRows, DenseRows, HasSizes
@@ -296,10 +297,8 @@ def problem_of(
     sizes = [jax.eval_shape(fn, vector).size for fn in functions]
 
     def converted(fn: Residual, value: Array) -> Residual:
-        """The residuals of an entry. The user's function may close over arrays, such as the
-        parameters of a network. Conversion makes them leaves of the problem: only so can the custom
-        rules differentiate by them."""
-        return _Converted(eqx.filter_closure_convert(lambda y: fn(y) - value, vector))
+        """The residuals of an entry."""
+        return ClosureConverted(lambda y: fn(y) - value, vector)
 
     flat, _ = jtu.tree_flatten_with_path(manifold, is_leaf=is_entry)
     shapes = jax.eval_shape(lambda y: evaluate(manifold, t, y, args), like)
@@ -317,21 +316,3 @@ def problem_of(
         pattern=pattern_of(functions, sizes, vector),
         **more,
     )
-
-
-class _Converted(eqx.Module):
-    """A function after closure conversion, in which the integers over which it closes keep their
-    values. They are usually indices, such as of `y[indices]`, and `scalars` can follow a function
-    that moves elements only if it knows the indices. For JAX the function `constants` is a leaf
-    that is no array, so that no transformation replaces what it returns by tracers."""
-
-    arrays: Any
-    constants: Callable[[], Any]
-
-    def __init__(self, fn: Any):
-        is_variable = lambda x: isinstance(x, jax.core.Tracer) or eqx.is_inexact_array(x)  # noqa: E731
-        self.arrays, constants = eqx.partition(fn, is_variable)
-        self.constants = lambda: constants
-
-    def __call__(self, y: Array) -> Array:
-        return eqx.combine(self.arrays, self.constants())(y)
