@@ -251,7 +251,7 @@ class ManifoldProjection(ForwardingSolver):
             rate_integrals=target.rate_integrals,
             last_fingerprint=state.last_fingerprint.at(step.t1, y1, args, self.manifold),
             statistics=state.statistics.add(
-                info, jnp.nan if step.error is None else problem.factor.norm(step.error)
+                info, -1.0 if step.error is None else problem.factor.norm(step.error)
             ),
         )
         error = error_for_controller(cause, is_final, wrapped.error)
@@ -302,13 +302,14 @@ class ManifoldProjection(ForwardingSolver):
         names = entry_names(self.manifold)
         if isinstance(state, State) and state.statistics.names == names:
             return state
-        of = "a solve by another solver"
+        given = "not the state of a solve by this solver"
         if isinstance(state, State):
             kept = ", ".join(state.statistics.names)
-            of = f"a solve with the entries {kept}, not {', '.join(names)}"
+            given = f"the state of a solve with the entries {kept}, not {', '.join(names)}"
         raise ValueError(
-            f"`solver_state` is the state of {of}. Pass that of a solve by this solver, or leave "
-            "it out: then the conserved values are those of `y0`."
+            f"`solver_state` is {given}. Pass what `solver.init(terms, t0, t1, y0, args)` or the "
+            "last `solver.step` returned, or to `diffeqsolve` none: then the conserved values are "
+            "those of `y0`."
         )
 
     def _target(

@@ -54,14 +54,16 @@ class ProjectionStatistics(eqx.Module):
     residual_after = property(lambda self: self.sizes[..., 1])
     correction = property(lambda self: self.sizes[..., 2])
     roundoff = property(lambda self: self.sizes[..., 3])
-    error = property(lambda self: self.sizes[..., 4])
+    error = property(lambda self: jnp.where(self._error >= 0, self._error, jnp.nan))
+    # A negative number says that there is none: with `jax_debug_nans` JAX refuses any NaN.
+    _error = property(lambda self: self.sizes[..., 4])
 
     @classmethod
     def zero(
         cls, manifold: Manifold, dtype: jnp.dtype, bounded: bool = False
     ) -> "ProjectionStatistics":
         names = entry_names(manifold)
-        counts, sizes = jnp.array([0, 0, 0, -1]), jnp.array([0, 0, 0, 0, jnp.nan], dtype)
+        counts, sizes = jnp.array([0, 0, 0, -1]), jnp.array([0, 0, 0, 0, -1], dtype)
         return cls(counts, sizes, names, bounded)
 
     def __str__(self) -> str:
@@ -83,7 +85,7 @@ class ProjectionStatistics(eqx.Module):
 
     def add(self, info: ProjectionInfo, error: Array | float) -> "ProjectionStatistics":
         """The statistics after one more step, with the report on its projection, and the length of
-        the error estimate, NaN if there is none."""
+        the error estimate, -1 if there is none."""
         counts = (
             self.num_projections + 1,
             self.num_iterations + info.num_iterations,
@@ -95,7 +97,7 @@ class ProjectionStatistics(eqx.Module):
             jnp.maximum(self.residual_after, info.residual_after),
             jnp.maximum(self.correction, info.correction),
             jnp.maximum(self.roundoff, info.roundoff),
-            jnp.fmax(self.error, error),
+            jnp.fmax(self._error, error),
         )
         return ProjectionStatistics(jnp.stack(counts), jnp.stack(sizes), self.names, self.bounded)
 
