@@ -135,7 +135,11 @@ test_mistakes_are_named = refused(
         (lambda x=x: run((ENERGY, FirstIntegral(lambda *_: x))), TypeError, r"1\]` must.*floating")
         for x in (1, True, 1j, "energy", np.ones(2, int))
     ),
-    (lambda: resumed(lambda *_: ()), ValueError, "`solver_state` is not the state of a solve by this"),
+    (
+        lambda: resumed(lambda *_: ()),
+        ValueError,
+        "`solver_state` is not the state of a solve by this",
+    ),
     (
         lambda: resumed(wrap([ENERGY]).init),
         ValueError,

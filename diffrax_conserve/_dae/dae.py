@@ -295,7 +295,8 @@ class DAE(Hashable):
         message = (
             "`consistent` found no state near the guess that satisfies the equations and their "
             "derivatives: give a better guess, or hold fewer unknowns fixed. `report(guess)` names "
-            "the equations that are differentiated."
+            "the equations that are differentiated. Where coefficients of slopes vanish, as at "
+            "rest, `dae.at(guess)` finds which slopes the equations can be solved for there."
         )
         if isinstance(ok, jax.core.Tracer):
             return eqx.error_if(found, ~ok, message)
@@ -669,7 +670,8 @@ class ConstraintProjection(AbstractProjection):
                 info = problem.report(candidate, found.y, found.num_iterations, ok=found.ok)
                 return found.y, info
             jacobian = tree_stop_gradient(problem.linearise(candidate)[1])
-            free = Diagonal(structure.equilibrated_units(sizes, jacobian))
+            units = structure.equilibrated_units(sizes, jacobian, structure.algebraic)
+            free = Diagonal(units)
             y, info = SimplifiedNewton().solve(dataclasses.replace(problem, factor=free), candidate)
             length = lax.stop_gradient(metric.norm(y - candidate))
             return y, dataclasses.replace(info, correction=length)
@@ -695,8 +697,10 @@ def _consistent(
     fixed = np.zeros(structure.size, bool) if flags is None else np.frombuffer(flags, bool)
     count, large = sum(len(structure.left(k)) for k in range(structure.index)), structure.large
     none = jnp.zeros(count, ravel(y).dtype)
-    shared = structure.shares_free or structure.determines_free
+    in_stages = flags is None and bool(structure.new_unknowns)
+    shared = not in_stages and (structure.shares_free or structure.determines_free)
     shared &= large is None or large.along is not None
+    algebraic = structure.free if in_stages else structure.algebraic
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage
@@ -709,14 +713,14 @@ def _consistent(
         if shared:  # then all move in all stages
             found = _nearest(dae, structure, problem, vector, sizes, fixed, MAX_NEWTON_STEPS)
             return unravel(found.y, y), found.ok
-        units = structure.equilibrated_units(sizes, problem.linearise(vector)[1])
+        units = structure.equilibrated_units(sizes, problem.linearise(vector)[1], algebraic)
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
         found, info = SimplifiedNewton(max_steps=MAX_NEWTON_STEPS).solve(problem, vector)
         return unravel(found, y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.
-    stages = structure.search_stages(freely=flags is None and not shared)
+    stages = structure.search_stages(freely=in_stages)
     found, ok = lax.scan(nearer, y, jtu.tree_map(jnp.asarray, stages))
     return found, ok[-1]
 
@@ -781,11 +785,11 @@ class _Slopes(eqx.Module):
 
 @final
 class _Constraints(eqx.Module):
-    """All constraints, or those of the rounds that are asked for. Not a closure, with which every
-    `wrap` would compile anew."""
+    """All constraints, or those that are asked for. Not a closure, with which every `wrap` would
+    compile anew."""
 
     dae: DAE
-    asked: Bool[Array, " rounds"] | None = None
+    asked: Bool[Array, " m"] | None = None
 
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> Values:
         given = _at(self.dae, t, y, args)
@@ -794,7 +798,9 @@ class _Constraints(eqx.Module):
         found = _value(Reduction.all_constraints, self.dae, given, args)
         if self.asked is None:
             return found
-        return [jnp.where(asked, h, 0) for asked, h in zip(self.asked, found, strict=True)]
+        ends = np.cumsum([h.size for h in found])[:-1]
+        asked = jnp.split(self.asked, ends)
+        return [jnp.where(*both, 0) for both in zip(asked, found, strict=True)]
 
 
 @final

@@ -29,7 +29,15 @@ from .._large.klu import SparseJacobian
 from .elimination import Elimination, NotFound, Round, SparseMatrix, elimination
 from .large import Large
 from .places import FindPlaces, Numbers
-from .reduction import LastConstraints, Singular, Structure, WithNumbers, general_states
+from .reduction import (
+    LastConstraints,
+    Singular,
+    Structure,
+    WithNumbers,
+    general_states,
+    new_unknowns,
+    usual,
+)
 
 # The largest index that is looked for. Each differentiation makes the functions larger, and
 # mechanisms have three.
@@ -80,7 +88,7 @@ def find_large_structure(
     places = FindPlaces(memory, numbers, unknown, t, y)
     large = once("places", found)
     by_y, by_slope = large.by_y, large.by_slope
-    t, y, of_y, values, is_linear, absent = _general_position(
+    t, y, of_y, values, at_rest, is_linear, absent = _general_position(
         equations, by_y, by_slope, numbers, t, y
     )
     matrix = other = _matrix(by_slope, values)
@@ -90,14 +98,14 @@ def find_large_structure(
         other = _matrix(by_slope, values)
         mass = matrix if (matrix != other).nnz == 0 else None
     none = np.zeros(0, int)
-    selected = extended(matrix, (none, none))
+    selected = extended(matrix, extended(_matrix(by_slope, at_rest), (none, none)))
     first = np.setdiff1d(np.arange(n), selected[0])
     is_semi_explicit = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
     structure = Structure(
         n, (), is_linear, mass, is_semi_explicit, without_slopes=_tuple(without), large=large
     )
-    seen, new_unknowns, met, needed = np.zeros(n, bool), [], [], none
+    needed = none
     in_places = by_slope.rows, by_slope.columns
     gradients = sp.csr_array((0, n))
     while len(selected[0]) < n:
@@ -130,10 +138,6 @@ def find_large_structure(
             last = LastConstraints(equations, structure)
             at = places.of(last, 1)
             new = _matrix(at, _last_values(last, at, numbers, t, y))
-        contained = ~_empty(new, 0)
-        new_unknowns.append(np.flatnonzero(contained & ~seen))
-        met.append(len(extended(new[:, new_unknowns[-1]], (none, none))[0]) == len(left))
-        seen |= contained
         gradients = sp.csr_array(sp.vstack([gradients, new]))
         independent = extended(gradients, (none, none))[0]
         if len(independent) < gradients.shape[0]:
@@ -152,10 +156,14 @@ def find_large_structure(
     shares_free = len(extended(part, (none, none))[0]) < part.shape[0]
     if structure.index > 1 and shares_free and large.along is None:
         raise NotFound(_NOT_CONSTANT)
-    structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
-    if all(met):
-        structure = dataclasses.replace(structure, new_unknowns=tuple(map(_tuple, new_unknowns)))
-    return structure
+    return dataclasses.replace(
+        structure,
+        large=large,
+        shares_free=shares_free,
+        new_unknowns=new_unknowns(
+            structure, gradients, lambda part: len(extended(part, (none, none))[0])
+        ),
+    )
 
 
 def _tuple(x: np.ndarray) -> tuple[int, ...]:
@@ -326,9 +334,12 @@ def _near(
     later, moved, slopes = general_states(t, y, share)
     fn = ft.partial(equations, numbers)
     of_y = by_y.values(lambda y: fn(later, y, slopes[0]), moved)
-    first, second = (by_slope.values(lambda s: fn(later, moved, s), x) for x in slopes)
+    given_at = jnp.stack([moved, moved, jnp.zeros_like(y)]), slopes[jnp.array([0, 1, 0])]
+    first, second, at_rest = jax.vmap(
+        lambda y, slopes: by_slope.values(ft.partial(fn, later, y), slopes)
+    )(*given_at)
     total = jnp.sum(fn(later, moved, slopes[0])) + jnp.sum(of_y) + jnp.sum(first + second)
-    return later, moved, of_y, first, jnp.all(first == second), jnp.isfinite(total)
+    return later, moved, of_y, first, at_rest, jnp.all(first == second), jnp.isfinite(total)
 
 
 def _general_position(
@@ -338,11 +349,13 @@ def _general_position(
     numbers: Numbers,
     t: Array,
     y: Array,
-) -> tuple[Array, Array, Array, Array, bool, tuple[int, ...]]:
+) -> tuple[Array, Array, Array, Array, np.ndarray, bool, tuple[int, ...]]:
     for share in (1e-1, 1e-3, 1e-5, 0.0):
         found = _near(equations, by_y, by_slope, numbers, t, y, share)
-        later, moved, of_y, values, is_linear, finite = found
+        later, moved, of_y, values, at_rest, is_linear, finite = found
         if finite:
             absent = _empty(_matrix(by_y, of_y), 0) & _empty(_matrix(by_slope, values), 0)
-            return later, moved, of_y, values, bool(is_linear), _tuple(np.flatnonzero(absent))
+            absent = _tuple(np.flatnonzero(absent))
+            at_rest = usual(np.asarray(at_rest), np.asarray(values))
+            return later, moved, of_y, values, at_rest, bool(is_linear), absent
     raise FloatingPointError

@@ -15,6 +15,7 @@ is found from numbers at a single state in general position.
 
 import dataclasses
 import functools as ft
+import itertools as it
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -42,6 +43,8 @@ from .places import FindPlaces, Numbers
 Implicit = Callable[[Array, Array, Array], Array]
 
 _NO_ROUND = Round((), ())  # nothing is solved yet
+# Outputs of outputs are looked for so often, in large systems too.
+_MOST_OUTPUTS = 8
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,9 +59,9 @@ class Structure:
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
       that cancel.
-    - `new_unknowns`: for each differentiation the unknowns that its constraints contain and those
-      before do not, such as positions, velocities and forces; empty if not all constraints can be
-      met by these alone.
+    - `new_unknowns`: for each stage the unknowns that its constraints contain and those before do
+      not, such as positions, velocities and forces; empty if a consistent state is not sought in
+      stages; see `stages`.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     - `shares_free`: whether the algebraic unknowns are in more constraints than they can meet, as
       where cells in parallel have one voltage.
@@ -123,6 +126,16 @@ class Structure:
         return tuple(i for i in range(self.size) if i not in solved)
 
     @property
+    def stages(self) -> np.ndarray:
+        """For each constraint the stage in which a consistent state is sought for it: the last
+        derivatives of all equations are met in the last stage, those before them in the one before
+        (J. D. Pryce, *A simple structural analysis method for DAEs*, BIT 41, 2001). So an equation
+        that only defines an output is met beside the forces, and not beside the positions."""
+        times = self.num_differentiations
+        of_round = ([k + self.index - times[i] for i in self.left(k)] for k in range(self.index))
+        return np.array([*it.chain(*of_round)], int)
+
+    @property
     def free(self) -> np.ndarray:
         """The unknowns for whose slopes the equations, as they are given, are not solved, such as
         forces. A projection moves them as far as the constraints ask for."""
@@ -148,17 +161,17 @@ class Structure:
         return self.by_free is not None or (self.large is not None and self.shares_free)
 
     def equilibrated_units(
-        self, sizes: Float[Array, " n"], jacobian: AbstractRows
+        self, sizes: Float[Array, " n"], jacobian: AbstractRows, algebraic: np.ndarray
     ) -> Float[Array, " n"]:
-        """The units of a projection that moves other unknowns only where algebraic ones, such as
-        forces, do not do. Those of the others are their sizes.
+        """The units of a projection that moves other unknowns only where the `algebraic` ones, such
+        as forces, do not do. Those of the others are their sizes.
 
         The sizes of algebraic unknowns may have any ratios, as at a start where some vanish, and a
         Gram matrix would square these. So their units come from the constraint Jacobian,
         equilibrated as by LAPACK's `geequ`: first each row is divided by its largest element, then
         each column. All are so large that they exceed in each row that has some what the other
         unknowns contribute, by the factor `1/ε`."""
-        is_algebraic = np.isin(np.arange(self.size), self.algebraic)
+        is_algebraic = np.isin(np.arange(self.size), algebraic)
         others = jacobian.scale_columns(jnp.where(is_algebraic, 0, sizes)).largest_in_rows()
         free = jacobian.scale_columns(jnp.asarray(is_algebraic, sizes.dtype))
         largest = free.largest_in_rows()
@@ -169,12 +182,12 @@ class Structure:
         return jnp.where(is_algebraic, factor / jnp.where(column > 0, column, 1), sizes)
 
     def search_stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The stages in which a consistent state is sought: the constraints of which rounds are
-        asked for, and which unknowns move. In the last two all are asked for, and all move."""
-        alone = self.new_unknowns if freely else ()
-        asked = [np.arange(self.index) == k for k in range(len(alone))]
+        """The stages in which a consistent state is sought: which constraints are asked for, and
+        which unknowns move. In the last two all are asked for, and all move."""
+        alone, stages = self.new_unknowns if freely else (), self.stages
+        asked = [stages == k for k in range(len(alone))]
         moving = [np.isin(np.arange(self.size), found) for found in alone]
-        last = np.full((2, self.index), True), np.full((2, self.size), True)
+        last = np.full((2, stages.size), True), np.full((2, self.size), True)
         return np.stack([*asked, *last[0]]), np.stack([*moving, *last[1]])
 
 
@@ -374,13 +387,13 @@ def find_structure(
     is constant, the other numbers tell. `unknown` are the numbers that may have any values;
     `memory` holds what does not depend on them, for the next search. While the ranks are those of
     a known structure, what that selects is taken, for which the programs are compiled."""
-    t, y, matrix, is_linear, absent = _general_position(equations, numbers, t, y)
+    t, y, matrix, at_rest, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
         later, moved = 2 * np.asarray(t) + 1, 2 * np.asarray(y)
         other = np.asarray(_by_slope(equations, others, later, moved, y))
         mass = matrix.copy() if np.array_equal(matrix, other) else None
-    selected, given = _extended(matrix, _NO_ROUND), matrix.copy()
+    selected, given = _extended(matrix, _extended(at_rest, _NO_ROUND)), matrix.copy()
     gradients = computed = np.zeros((0, y.size))  # without and with roundoff
     both = np.stack([matrix, other])
     rest = np.delete(both, selected.equations, axis=1)
@@ -392,11 +405,12 @@ def find_structure(
     by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
     eliminated = ft.partial(_with_elimination, ft.partial(_is_linear, by_slopes, t, y))
     places = find.dense(equations, 2, y.size)
-    new_unknowns, met = [], []
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         before = known.rounds[structure.index :] if known is not None else ()
         if before and len(before[0].slopes) == len(selected.slopes):
-            selected = before[0]
+            inner = matrix[np.ix_(*before[0])]
+            if len(_extended(inner, _NO_ROUND).slopes) == len(inner):
+                selected = before[0]
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         needed = np.any(places[list(left)], axis=0)
@@ -405,8 +419,6 @@ def find_structure(
         by_slope = np.where(matrix == 0, 0, by_slope)
         with_roundoff, terms = _reduced(np.asarray(by_y), by_slope, selected, left)
         new = _unless_roundoff(with_roundoff, terms)
-        new_unknowns.append((new != 0).any(0) & ~(gradients != 0).any(0))
-        met.append(len(_extended(new[:, new_unknowns[-1]], _NO_ROUND).equations) == len(new))
         computed = np.concatenate([computed, with_roundoff])
         gradients = np.concatenate([gradients, new])
         independent = _extended(gradients, _NO_ROUND).equations
@@ -420,8 +432,7 @@ def find_structure(
         places[list(left)] = find.dense(last, 1, len(left))
     every = tuple(range(y.size))
     structure = eliminated(structure, places, Round(every, every), np.full(y.size, True))
-    found = new_unknowns if all(met) else []
-    return _with_unknowns(structure, gradients, computed, given, found)
+    return _with_unknowns(structure, gradients, computed, given)
 
 
 def _is_linear(
@@ -483,7 +494,6 @@ def _with_unknowns(
     gradients: Float[np.ndarray, "m n"],
     computed: Float[np.ndarray, "m n"],
     by_slope: Float[np.ndarray, "n n"],
-    new_unknowns: list[Bool[np.ndarray, " n"]],
 ) -> Structure:
     """The structure with what is known of its constraints, from their gradients without and with
     roundoff."""
@@ -502,8 +512,48 @@ def _with_unknowns(
         structure,
         shares_free=shares_free,
         by_free=by_free if must_know else None,
-        new_unknowns=tuple(tuple(np.flatnonzero(one).tolist()) for one in new_unknowns),
+        new_unknowns=new_unknowns(
+            structure,
+            sp.csr_array(gradients),
+            lambda part: len(_extended(part.toarray(), _NO_ROUND).equations),
+        ),
     )
+
+
+def new_unknowns(
+    structure: Structure, gradients: sp.csr_array, rank: Callable[[sp.csr_array], int]
+) -> tuple[tuple[int, ...], ...]:
+    """The new unknowns of each stage, from the gradients of all constraints; empty if these do not
+    meet its constraints, or if forces or currents are in constraints of several stages."""
+    if _are_shared(structure, gradients, rank):
+        return ()
+    seen, found = np.zeros(structure.size, bool), []
+    for k in range(structure.index):
+        rows = gradients[np.flatnonzero(structure.stages == k)]
+        contained = np.bincount(rows.indices, minlength=structure.size) > 0
+        found.append(np.flatnonzero(contained & ~seen))
+        if rank(rows[:, found[-1]]) < rows.shape[0]:
+            return ()
+        seen |= contained
+    return tuple(tuple(x.tolist()) for x in found)
+
+
+def _are_shared(
+    structure: Structure, gradients: sp.csr_array, rank: Callable[[sp.csr_array], int]
+) -> bool:
+    """Whether free unknowns are in constraints of an earlier stage than the last, or in more than
+    they can meet. An unknown that is in one constraint alone is only an output, and does not
+    count; nor does one that is in one other constraint beside it, and so on."""
+    rows, columns = sp.coo_array(gradients).coords
+    is_free = np.isin(columns, structure.free)
+    rows, columns = rows[is_free], columns[is_free]
+    for _ in range(_MOST_OUTPUTS):
+        alone = (np.bincount(columns) == 1)[columns]
+        others = ~np.isin(rows, rows[alone])
+        rows, columns = rows[others], columns[others]
+    rows, columns = np.unique(rows), np.unique(columns)
+    is_early = np.any(structure.stages[rows] < structure.index - 1)
+    return bool(is_early) or rank(gradients[rows][:, columns]) < rows.size
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.
@@ -544,9 +594,23 @@ def _combinations(
     rows: Float[np.ndarray, "m k"], matrix: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "m k"]:
     """`rows matrix⁻¹`, the combinations of the rows of a regular matrix that `rows` are."""
-    inverse = np.linalg.inv(matrix)
+    inverse = np.where(_reaches(matrix), np.linalg.inv(matrix), 0)
     inverse = _unless_roundoff(inverse, abs(inverse) @ abs(matrix) @ abs(inverse))
     return _unless_roundoff(rows @ inverse, abs(rows) @ abs(inverse))
+
+
+def _reaches(matrix: Float[np.ndarray, "k k"]) -> Bool[np.ndarray, "k k"]:
+    """Where the inverse can have elements: an unknown depends on the right side of an equation only
+    by a chain of equations. What pivots leave elsewhere is roundoff of numbers that are not seen
+    in the inverse."""
+    places = sp.csr_array(matrix != 0)
+    own = sp.csgraph.maximum_bipartite_matching(places, perm_type="row")
+    chain = (matrix[own] != 0).astype(float)
+    for _ in range(len(matrix).bit_length()):
+        chain = (chain @ chain != 0).astype(float)
+    reached = np.zeros(matrix.shape, bool)
+    reached[:, own] = chain != 0
+    return reached
 
 
 def _unless_roundoff(
@@ -577,11 +641,14 @@ def _near(
     given = small(ft.partial(equations, numbers), t, y, y)
     later, moved, slopes = general_states(t, y, share)
     all_at = small(lambda *now: (given(*now), *jax.jacfwd(given, (1, 2))(*now)), t, y, y)
-    values, by_ys, by_slope = jax.vmap(lambda slope: all_at(later, moved, slope))(slopes)
+    given_at = jnp.stack([moved, moved, jnp.zeros_like(y)]), slopes[jnp.array([0, 1, 0])]
+    values, by_ys, by_slopes = jax.vmap(ft.partial(all_at, later))(*given_at)
+    values, by_ys, by_slope = values[:2], by_ys[:2], by_slopes[:2]
     value, by_y = values[0], by_ys[0]
     finite = jnp.all(jnp.isfinite(value + by_y.sum(1) + by_slope.sum((0, 2))))
     absent = ~jnp.any(by_y, 0) & ~jnp.any(by_slope, (0, 1))
-    return later, moved, by_slope[0], jnp.all(by_slope[0] == by_slope[1]), absent, finite
+    is_linear = jnp.all(by_slope[0] == by_slope[1])
+    return later, moved, by_slope[0], by_slopes[2], is_linear, absent, finite
 
 
 def general_states(t: Array, y: Array, share: float | Array) -> tuple[Array, Array, Array]:
@@ -619,13 +686,21 @@ def _extended(matrix: np.ndarray, selected: Round) -> Round:
 
 def _general_position(
     equations: WithNumbers, numbers: Numbers, t: Array, y: Array
-) -> tuple[Array, Array, np.ndarray, bool, tuple[int, ...]]:
+) -> tuple[Array, Array, np.ndarray, np.ndarray, bool, tuple[int, ...]]:
     """A time and a state in general position, near the given ones, at which the equations and their
-    derivatives are finite; `∂F/∂y'` there; whether it depends on `y'`; and the unknowns that no
-    equation contains."""
+    derivatives are finite; `∂F/∂y'` there, and at rest, where its elements are finite; whether it
+    depends on `y'`; and the unknowns that no equation contains."""
     for share in (1e-1, 1e-3, 1e-5, 0.0):
-        later, moved, by_slope, is_linear, absent, finite = _near(equations, numbers, t, y, share)
+        later, moved, *by_slope, is_linear, absent, finite = _near(equations, numbers, t, y, share)
         if finite:
+            matrix, at_rest = (np.array(x) for x in by_slope)
             positions = tuple(np.flatnonzero(absent).tolist())
-            return later, moved, np.array(by_slope), bool(is_linear), positions
+            return later, moved, matrix, usual(at_rest, matrix), bool(is_linear), positions
     raise FloatingPointError
+
+
+def usual(at_rest: Any, values: Any) -> Any:
+    """The elements of `∂F/∂y'` at a state of zeros, where they are finite and not zero in general
+    position. Slopes are solved for by these first: others may vanish in a solve, as the velocities
+    do by which a power is computed from accelerations."""
+    return np.where(np.isfinite(at_rest) & (values != 0), at_rest, 0)

@@ -290,3 +290,39 @@ def test_a_combination_of_all_equations_changes_nothing():
         ends.append((y0, sol.ys[-1]))
     for a, b, accuracy in zip(*ends, (1e-13, 1e-6), strict=True):
         np.testing.assert_allclose(a, b, rtol=accuracy, atol=accuracy)
+
+
+OUTPUTS = {
+    "acceleration": lambda y, dy: dy[1][0],
+    "force along x": lambda y, dy: y[2][0] * y[0][0],
+    "power": lambda y, dy: y[1] @ dy[1],  # at rest it contains no slopes
+}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_an_output_changes_nothing(name, speed):
+    """A double pendulum whose positions satisfy their constraints keeps them, with an output that
+    nothing depends on, and whether it is at rest or not."""
+
+    def lengths(q):
+        return jnp.stack([q[0] ** 2 + q[1] ** 2 - 1, (q[2] - q[0]) ** 2 + (q[3] - q[1]) ** 2 - 1])
+
+    def pendulum(t, y, dy, args):
+        (q, v, forces), (dq, dv, _) = y, dy
+        gravity = 9.81 * jnp.array([0.0, 1.0, 0.0, 1.0])
+        return dq - v, dv + gravity - jax.vjp(lengths, q)[1](forces)[0], lengths(q)
+
+    def with_output(t, y, dy, args):
+        *states, output = y
+        return *pendulum(t, states, dy[:3], args), output - OUTPUTS[name](states, dy)
+
+    q = jnp.array([0.8, -0.6, 1.6, -1.2])
+    guess = q, speed * jnp.array([0.3, 0.2, 0.6, 0.8]), jnp.zeros(2)
+    alone = dfc.DAE(residual=pendulum).consistent(guess)
+    *states, output = dfc.DAE(residual=with_output).consistent((*guess, jnp.array(0.0)))
+    np.testing.assert_allclose(states[0], q, rtol=4 * EPS)
+    for found, expected in zip(states, alone, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e3 * EPS)
+    slopes = dfc.DAE(residual=pendulum).term.vf(0.0, alone, None)
+    np.testing.assert_allclose(output, OUTPUTS[name](alone, slopes), rtol=0, atol=1e3 * EPS)
