@@ -103,7 +103,14 @@ def find_large_structure(
     is_semi_explicit = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
     structure = Structure(
-        n, (), is_linear, mass, is_semi_explicit, without_slopes=_tuple(without), large=large
+        n,
+        (),
+        is_linear,
+        mass,
+        is_semi_explicit,
+        always_fits=mass is not None or not np.isin(first, by_slope.rows).any(),
+        without_slopes=_tuple(without),
+        large=large,
     )
     needed = none
     in_places = by_slope.rows, by_slope.columns

@@ -59,6 +59,7 @@ class Structure:
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
       that cancel.
+    - `always_fits`: whether their program tells that they contain none, whatever the numbers are.
     - `new_unknowns`: for each stage the unknowns that its constraints contain and those before do
       not, such as positions, velocities and forces; empty if a consistent state is not sought in
       stages; see `stages`.
@@ -76,6 +77,7 @@ class Structure:
     is_linear: bool
     mass: Any = None
     is_semi_explicit: bool = False
+    always_fits: bool = False
     new_unknowns: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
     shares_free: bool = False
@@ -322,7 +324,7 @@ class Reduction:
         """Whether the equations that are left contain no slopes with the numbers at hand, which may
         be others than those with which the structure was found."""
         structure = self.structure
-        if structure.mass is not None or not structure.rounds:
+        if structure.always_fits or not structure.rounds:
             return jnp.asarray(True)
         if structure.large is not None:
             by_slope, slopes = structure.large.by_slope, jnp.zeros_like(y)
@@ -398,13 +400,19 @@ def find_structure(
     both = np.stack([matrix, other])
     rest = np.delete(both, selected.equations, axis=1)
     without = tuple(np.flatnonzero(~both.any((0, 1))).tolist())
-    structure = Structure(
-        y.size, (), is_linear, mass, is_semi_explicit=not np.any(rest), without_slopes=without
-    )
     find = FindPlaces(memory, numbers, unknown, t, y)
+    places = find.dense(equations, 2, y.size)
+    structure = Structure(
+        y.size,
+        (),
+        is_linear,
+        mass,
+        is_semi_explicit=not np.any(rest),
+        always_fits=mass is not None or not np.delete(places, selected.equations, axis=0).any(),
+        without_slopes=without,
+    )
     by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
     eliminated = ft.partial(_with_elimination, ft.partial(_is_linear, by_slopes, t, y))
-    places = find.dense(equations, 2, y.size)
     while len((selected := _extended(matrix, selected)).equations) < y.size:
         before = known.rounds[structure.index :] if known is not None else ()
         if before and len(before[0].slopes) == len(selected.slopes):
