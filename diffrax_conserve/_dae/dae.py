@@ -275,7 +275,8 @@ class DAE(Hashable):
             equations differentiate stays, such as $x$ or $M y$. With a higher index the state moves
             to the nearest point, in the Euclidean distance of what they differentiate. If each
             differentiation brings unknowns with which its constraints can be met, these alone move
-            for them: of a mechanism first the positions, then the velocities, then the forces.
+            for them: of a mechanism first the positions, then the velocities, then the forces and
+            outputs, such as a power.
 
         **Returns:**
 
