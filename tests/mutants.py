@@ -363,6 +363,30 @@ def count_the_roundoff_of_a_combination_as_an_equation(package):
     package.around("_unless_roundoff")(lambda old, values, terms: values)
 
 
+def solve_for_slopes_whose_coefficients_vanish_at_rest(package):
+    package.around("usual")(lambda old, at_rest, values: values)
+
+
+def share_currents_in_stages(package):
+    package.around("_are_shared")(lambda old, *given: False)
+
+
+def leave_what_pivots_leave_in_an_inverse(package):
+    package.around("_reaches")(lambda old, matrix: np.ones(matrix.shape, bool))
+
+
+def divide_by_the_unit_of_an_unknown_that_has_not_moved(package):
+    package.around("_positive")(lambda old, units, *given: units)
+
+
+def begin_with_slopes_of_zero(package):
+    package.replace("_IndexOneEquations.first_slopes", lambda self, *given: None)
+
+
+def compare_the_shardings_of_a_closure(package):
+    package.replace("ClosureConverted", eqx.filter_closure_convert)
+
+
 def forget_the_sign_of_a_defect_of_an_invariant(package):
     package.in_module_of(
         "check_invariance", "relative_to_scale", lambda *x: jnp.maximum(relative_to_scale(*x), 0)

@@ -301,7 +301,7 @@ OUTPUTS = {
 
 @pytest.mark.parametrize("name", OUTPUTS)
 @pytest.mark.parametrize("speed", [0.0, 1.0])
-def test_an_output_changes_nothing(name, speed):
+def test_an_output_changes_no_consistent_state(name, speed):
     """A double pendulum whose positions satisfy their constraints keeps them, with an output that
     nothing depends on, and whether it is at rest or not."""
 
