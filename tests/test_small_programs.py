@@ -194,10 +194,10 @@ def test_whether_equations_contain_slopes_is_told_by_their_program():
         return (v[0] ** 2 + (v[1] * jnp.sin(q[0])) ** 2 + (v[2] + v[1] * jnp.cos(q[0])) ** 2) / 2
 
     def top(t, y, dy, some=0.0):
-        (q, v, force), (dq, dv, _) = y, dy
+        (q, v, force), (dq, dv, df) = y, dy
         momentum = jax.jvp(lambda q, v: jax.grad(energy, 1)(q, v), (q, v), (v, dv))[1]
         forces = jnp.array([0, 0, force])
-        return dq - v, jax.grad(energy)(q, v) + forces - momentum, q[2] - q[1] + some * dq[0]
+        return dq - v, jax.grad(energy)(q, v) + forces - momentum, q[2] - q[1] + some * df
 
     y, some = (Y, Y[::-1], Y[0]), jnp.array(0.0)
     without = dfc.DAE(residual=lambda t, y, dy, args: top(t, y, dy))

@@ -102,13 +102,16 @@ def find_large_structure(
     first = np.setdiff1d(np.arange(n), selected[0])
     is_semi_explicit = not (matrix[first].nnz or other[first].nnz)
     without = np.flatnonzero(_empty(matrix, 0) & _empty(other, 0))
+    without_free = np.isin(by_slope.columns, selected[1]).all()
+    in_rest = np.isin(first, by_slope.rows).any()
     structure = Structure(
         n,
         (),
         is_linear,
         mass,
         is_semi_explicit,
-        always_fits=mass is not None or not np.isin(first, by_slope.rows).any(),
+        always_fits=bool(mass is not None or without_free or not in_rest),
+        without_free=bool(without_free),
         without_slopes=_tuple(without),
         large=large,
     )

@@ -59,7 +59,9 @@ class Structure:
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
       that cancel.
-    - `always_fits`: whether their program tells that they contain none, whatever the numbers are.
+    - `always_fits`: whether their program tells that these contain none once the selected slopes are
+      eliminated, whatever the numbers are.
+    - `without_free`: whether it tells that no equation contains slopes of the `free` unknowns.
     - `new_unknowns`: for each stage the unknowns that its constraints contain and those before do
       not, such as positions, velocities and forces; empty if a consistent state is not sought in
       stages; see `stages`.
@@ -78,6 +80,7 @@ class Structure:
     mass: Any = None
     is_semi_explicit: bool = False
     always_fits: bool = False
+    without_free: bool = False
     new_unknowns: tuple[tuple[int, ...], ...] = ()
     without_slopes: tuple[int, ...] = ()
     shares_free: bool = False
@@ -305,10 +308,12 @@ class Reduction:
         rows, columns = (np.array(x, int) for x in structure.rounds[0])
         if structure.large is not None:
             return structure.large.along, free
-        matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
-        solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
         one = jnp.eye(free.size, dtype=y.dtype)
         along = jnp.zeros((structure.size, free.size), y.dtype).at[free].set(one)
+        if structure.without_free:
+            return along, free
+        matrix = structure.mass if structure.mass is not None else self._by_slopes(t, y)
+        solve = np.linalg.solve if structure.mass is not None else jnp.linalg.solve
         inner, outer = matrix[np.ix_(rows, columns)], matrix[np.ix_(rows, free)]
         return along.at[columns].set(jnp.asarray(-solve(inner, outer), y.dtype)), free
 
@@ -402,13 +407,16 @@ def find_structure(
     without = tuple(np.flatnonzero(~both.any((0, 1))).tolist())
     find = FindPlaces(memory, numbers, unknown, t, y)
     places = find.dense(equations, 2, y.size)
+    without_free = not np.delete(places, selected.slopes, axis=1).any()
+    in_rest = np.delete(places, selected.equations, axis=0).any()
     structure = Structure(
         y.size,
         (),
         is_linear,
         mass,
         is_semi_explicit=not np.any(rest),
-        always_fits=mass is not None or not np.delete(places, selected.equations, axis=0).any(),
+        always_fits=mass is not None or without_free or not in_rest,
+        without_free=without_free,
         without_slopes=without,
     )
     by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
