@@ -59,8 +59,8 @@ class Structure:
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
       that cancel.
-    - `always_fits`: whether their program tells that these contain none once the selected slopes are
-      eliminated, whatever the numbers are.
+    - `always_fits`: whether their program tells that these contain none, whatever the numbers are,
+      once the selected slopes are eliminated.
     - `without_free`: whether it tells that no equation contains slopes of the `free` unknowns.
     - `new_unknowns`: for each stage the unknowns that its constraints contain and those before do
       not, such as positions, velocities and forces; empty if a consistent state is not sought in
