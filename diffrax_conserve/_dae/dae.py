@@ -35,7 +35,7 @@ from .._projection.options import check_state, refuse_half_precision
 from .._projection.simplified_newton import SimplifiedNewton
 from .._projection.staged import Staged
 from .._solver.manifold_projection import ManifoldProjection, or_trivial
-from .._tree import ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
+from .._tree import eps_of, ravel, tree_all_finite, tree_shapes, tree_stop_gradient, unravel
 from .elimination import NotFound, SparseMatrix
 from .free_unknowns import nearest_with_free
 from .newton import (
@@ -697,7 +697,10 @@ def _consistent(
         return found, tree_all_finite(found)
     fixed = np.zeros(structure.size, bool) if flags is None else np.frombuffer(flags, bool)
     count, large = sum(len(structure.left(k)) for k in range(structure.index)), structure.large
-    none = jnp.zeros(count, ravel(y).dtype)
+    guess = ravel(y)
+    none = jnp.zeros(count, guess.dtype)
+    # What should be zero would have no tolerance, if it were compared with its own size alone.
+    little = eps_of(guess)
     in_stages = flags is None and bool(structure.new_unknowns)
     shared = not in_stages and (structure.shares_free or structure.determines_free)
     shared &= large is None or large.along is not None
@@ -709,7 +712,9 @@ def _consistent(
         cancellation = cancellation_scale(manifold, t, y, args)[2]
         vector, moving = ravel(y), moving & ~fixed
         least = None if large is None else least_exact(vector.dtype)
-        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least)
+        problem = problem_of(
+            manifold, none, t, y, args, cancellation, atol=least, changes=little * jnp.abs(guess)
+        )
         sizes = moving.astype(vector.dtype)
         if shared:  # then all move in all stages
             found = _nearest(dae, structure, problem, vector, sizes, fixed, MAX_NEWTON_STEPS)
@@ -824,7 +829,7 @@ class _IndexOneEquations(eqx.Module):
         given = _at(self.dae, t, y, args)
         if given[0].is_linear:
             return None
-        return _value(Reduction.all_slopes, self.dae, given, args)
+        return _value(Reduction.nonlinear_slopes, self.dae, given, args)
 
     def __call__(self, t: RealScalarLike, y: Y, slopes: Y, args: Args) -> Array:
         given = _at(self.dae, t, y, args)

@@ -54,7 +54,8 @@ class Structure:
     - `size`: the number of equations and of unknowns.
     - `rounds`: for each differentiation, what is solved for what before it.
     - `eliminations`: for each differentiation, how the slopes follow that its constraints need;
-      `None` where they need none. In a small system one more, for all slopes at the end.
+      `None` where they need none. In a small system one more, for all slopes at the end, and
+      another for those in which the equations are not linear, if there are any.
     - `is_linear`: whether the equations are linear in the slopes.
     - `mass`: `∂F/∂y'`, if it is known to be constant.
     - `is_semi_explicit`: whether the equations that are left first contain no slopes, not even some
@@ -249,10 +250,10 @@ class Reduction:
         return further
 
     def slopes(self, k: int) -> Callable[[Array, Array], Array]:
-        """The slopes that the constraints of round `k` need, or after the last one all of them.
-        Others are zero."""
+        """The slopes that the constraints of round `k` need; after the last one all of them, and
+        then those in which the equations are not linear. Others are zero."""
         structure, equations, constraints = self.structure, self.equations, self.constraints
-        is_last = structure.large is not None and k == structure.index
+        is_last = structure.large is not None and k >= structure.index
         found = None if is_last else structure.eliminations[k]
         if found is None and not is_last:  # the equations that are left contain no slopes
             return lambda t, y: jnp.zeros_like(y)
@@ -346,6 +347,10 @@ class Reduction:
     def all_slopes(self, t: Array, y: Array) -> Array:
         """The slopes after all differentiations; NaN where the structure does not fit."""
         return self._where_it_fits(self.slopes(self.structure.index), t, y)
+
+    def nonlinear_slopes(self, t: Array, y: Array) -> Array:
+        """The slopes on which `∂F/∂y'` depends; in large systems all."""
+        return self.slopes(self.structure.index + 1)(t, y)
 
     def all_constraints(self, t: Array, y: Array) -> list[Array]:
         """The constraints; NaN where the structure does not fit."""
@@ -448,6 +453,9 @@ def find_structure(
         places[list(left)] = find.dense(last, 1, len(left))
     every = tuple(range(y.size))
     structure = eliminated(structure, places, Round(every, every), np.full(y.size, True))
+    if not is_linear:
+        needed = _nonlinear(by_slopes, t, y)
+        structure = eliminated(structure, places, Round(every, every), needed)
     return _with_unknowns(structure, gradients, computed, given)
 
 
@@ -468,6 +476,14 @@ def _is_linear(
     moved = jnp.where(np.isin(np.arange(y.size), columns), others, slopes)
     both = (np.asarray(by_slopes(x))[np.ix_(given, columns)] for x in (slopes, moved))
     return np.array_equal(*both, equal_nan=False)
+
+
+def _nonlinear(by_slopes: Callable[[Array], Array], t: Array, y: Array) -> Bool[np.ndarray, " n"]:
+    """The slopes on which `∂F/∂y'` depends."""
+    _, _, (slopes, others) = general_states(t, y, 0.0)
+    first = np.asarray(by_slopes(slopes))
+    moved = (by_slopes(slopes.at[j].set(others[j])) for j in range(y.size))
+    return np.array([not np.array_equal(first, np.asarray(x)) for x in moved])
 
 
 def _with_elimination(

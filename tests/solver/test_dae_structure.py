@@ -296,6 +296,7 @@ OUTPUTS = {
     "acceleration": lambda y, dy: dy[1][0],
     "force along x": lambda y, dy: y[2][0] * y[0][0],
     "power": lambda y, dy: y[1] @ dy[1],  # at rest it contains no slopes
+    "power of a force": lambda y, dy: y[2][0] * y[0][0] * y[1][0],  # and here nothing but itself
 }
 
 
@@ -320,7 +321,7 @@ def test_an_output_changes_no_consistent_state(name, speed):
     q = jnp.array([0.8, -0.6, 1.6, -1.2])
     guess = q, speed * jnp.array([0.3, 0.2, 0.6, 0.8]), jnp.zeros(2)
     alone = dfc.DAE(residual=pendulum).consistent(guess)
-    *states, output = dfc.DAE(residual=with_output).consistent((*guess, jnp.array(0.0)))
+    *states, output = dfc.DAE(residual=with_output).consistent((*guess, jnp.array(0.3)))
     np.testing.assert_allclose(states[0], q, rtol=4 * EPS)
     for found, expected in zip(states, alone, strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e3 * EPS)
