@@ -701,10 +701,9 @@ def _consistent(
     none = jnp.zeros(count, guess.dtype)
     # What should be zero would have no tolerance, if it were compared with its own size alone.
     little = eps_of(guess)
-    in_stages = flags is None and bool(structure.new_unknowns)
-    shared = not in_stages and (structure.shares_free or structure.determines_free)
-    shared &= large is None or large.along is not None
-    algebraic = structure.free if in_stages else structure.algebraic
+    shared = structure.is_shared and (large is None or large.along is not None)
+    in_stages = flags is None and not (shared and large is not None)
+    algebraic = structure.algebraic if structure.is_shared else structure.free
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage
@@ -716,8 +715,9 @@ def _consistent(
             manifold, none, t, y, args, cancellation, atol=least, changes=little * jnp.abs(guess)
         )
         sizes = moving.astype(vector.dtype)
-        if shared:  # then all move in all stages
-            found = _nearest(dae, structure, problem, vector, sizes, fixed, MAX_NEWTON_STEPS)
+        if shared:
+            still = ~moving if large is None else fixed
+            found = _nearest(dae, structure, problem, vector, sizes, still, MAX_NEWTON_STEPS)
             return unravel(found.y, y), found.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1], algebraic)
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
@@ -737,7 +737,7 @@ def _nearest(
     problem: Problem,
     candidate: Float[Array, " n"],
     sizes: Float[Array, " n"],
-    fixed: Bool[np.ndarray, " n"] | None = None,
+    fixed: Any = None,
     max_steps: int = MAX_STEPS,
 ) -> Solved:
     """The nearest state on the constraints, with unknowns of these sizes, unless they are free."""

@@ -48,7 +48,7 @@ def nearest_with_free(
     along: Float[Array, "n f"] | SparseMatrix,
     free: np.ndarray,
     by_free: Bool[np.ndarray, "m f"] | None,
-    fixed: Bool[np.ndarray, " n"] | None = None,
+    fixed: Any = None,
     *,
     max_steps: int,
 ) -> Solved:
@@ -59,7 +59,7 @@ def nearest_with_free(
     - `units`: of the unknowns that are not free.
     - `along`: the columns of `N`, with the coordinates `free`.
     - `by_free`: which constraints depend on which of them, if that is known.
-    - `fixed`: the unknowns that stay as they are.
+    - `fixed`: the unknowns that stay as they are; for sparse matrices known while JAX traces.
     """
     fixed = np.zeros(candidate.size, bool) if fixed is None else fixed
     problem_at, at, units = tree_stop_gradient((problem, candidate, units))

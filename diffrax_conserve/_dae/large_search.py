@@ -35,8 +35,8 @@ from .reduction import (
     Structure,
     WithNumbers,
     general_states,
-    new_unknowns,
     usual,
+    with_stages,
 )
 
 # The largest index that is looked for. Each differentiation makes the functions larger, and
@@ -166,14 +166,8 @@ def find_large_structure(
     shares_free = len(extended(part, (none, none))[0]) < part.shape[0]
     if structure.index > 1 and shares_free and large.along is None:
         raise NotFound(_NOT_CONSTANT)
-    return dataclasses.replace(
-        structure,
-        large=large,
-        shares_free=shares_free,
-        new_unknowns=new_unknowns(
-            structure, gradients, lambda part: len(extended(part, (none, none))[0])
-        ),
-    )
+    structure = dataclasses.replace(structure, large=large, shares_free=shares_free)
+    return with_stages(structure, gradients, lambda part: extended(part, (none, none))[0])
 
 
 def _tuple(x: np.ndarray) -> tuple[int, ...]:

@@ -15,7 +15,6 @@ is found from numbers at a single state in general position.
 
 import dataclasses
 import functools as ft
-import itertools as it
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -63,9 +62,12 @@ class Structure:
     - `always_fits`: whether their program tells that these contain none, whatever the numbers are,
       once the selected slopes are eliminated.
     - `without_free`: whether it tells that no equation contains slopes of the `free` unknowns.
+    - `stages`: for each constraint the stage in which a consistent state is sought for it, such as
+      those of positions, velocities and forces.
     - `new_unknowns`: for each stage the unknowns that its constraints contain and those before do
-      not, such as positions, velocities and forces; empty if a consistent state is not sought in
-      stages; see `stages`.
+      not; empty if a consistent state is not sought in stages.
+    - `is_shared`: whether free unknowns that are not outputs are in constraints of an earlier stage
+      than the last, or in more than they can meet.
     - `without_slopes`: the unknowns whose slopes no equation contains, as the equations are given.
     - `shares_free`: whether the algebraic unknowns are in more constraints than they can meet, as
       where cells in parallel have one voltage.
@@ -82,7 +84,9 @@ class Structure:
     is_semi_explicit: bool = False
     always_fits: bool = False
     without_free: bool = False
+    stages: tuple[int, ...] = ()
     new_unknowns: tuple[tuple[int, ...], ...] = ()
+    is_shared: bool = False
     without_slopes: tuple[int, ...] = ()
     shares_free: bool = False
     by_free: Bool[np.ndarray, "m f"] | None = None
@@ -130,16 +134,6 @@ class Structure:
         """The equations that are left in a round, and give constraints."""
         solved = set(self.rounds[k].equations)
         return tuple(i for i in range(self.size) if i not in solved)
-
-    @property
-    def stages(self) -> np.ndarray:
-        """For each constraint the stage in which a consistent state is sought for it: the last
-        derivatives of all equations are met in the last stage, those before them in the one before
-        (J. D. Pryce, *A simple structural analysis method for DAEs*, BIT 41, 2001). So an equation
-        that only defines an output is met beside the forces, and not beside the positions."""
-        times = self.num_differentiations
-        of_round = ([k + self.index - times[i] for i in self.left(k)] for k in range(self.index))
-        return np.array([*it.chain(*of_round)], int)
 
     @property
     def free(self) -> np.ndarray:
@@ -190,10 +184,10 @@ class Structure:
     def search_stages(self, freely: bool) -> tuple[np.ndarray, np.ndarray]:
         """The stages in which a consistent state is sought: which constraints are asked for, and
         which unknowns move. In the last two all are asked for, and all move."""
-        alone, stages = self.new_unknowns if freely else (), self.stages
-        asked = [stages == k for k in range(len(alone))]
+        alone, count = self.new_unknowns if freely else (), sum(self.num_differentiations)
+        asked = [np.array(self.stages) == k for k in range(len(alone))]
         moving = [np.isin(np.arange(self.size), found) for found in alone]
-        last = np.full((2, stages.size), True), np.full((2, self.size), True)
+        last = np.full((2, count), True), np.full((2, self.size), True)
         return np.stack([*asked, *last[0]]), np.stack([*moving, *last[1]])
 
 
@@ -540,52 +534,48 @@ def _with_unknowns(
     )
     hidden = np.any(by_free != with_roundoff)
     must_know = shares_free or structure.determines_free or hidden
-    return dataclasses.replace(
-        structure,
-        shares_free=shares_free,
-        by_free=by_free if must_know else None,
-        new_unknowns=new_unknowns(
-            structure,
-            sp.csr_array(gradients),
-            lambda part: len(_extended(part.toarray(), _NO_ROUND).equations),
-        ),
+    structure = dataclasses.replace(
+        structure, shares_free=shares_free, by_free=by_free if must_know else None
     )
+    independent = lambda part: _extended(part.toarray(), _NO_ROUND).equations  # noqa: E731
+    return with_stages(structure, sp.csr_array(gradients), independent)
 
 
-def new_unknowns(
-    structure: Structure, gradients: sp.csr_array, rank: Callable[[sp.csr_array], int]
-) -> tuple[tuple[int, ...], ...]:
-    """The new unknowns of each stage, from the gradients of all constraints; empty if these do not
-    meet its constraints, or if forces or currents are in constraints of several stages."""
-    if _are_shared(structure, gradients, rank):
-        return ()
-    seen, found = np.zeros(structure.size, bool), []
-    for k in range(structure.index):
-        rows = gradients[np.flatnonzero(structure.stages == k)]
-        contained = np.bincount(rows.indices, minlength=structure.size) > 0
-        found.append(np.flatnonzero(contained & ~seen))
-        if rank(rows[:, found[-1]]) < rows.shape[0]:
-            return ()
-        seen |= contained
-    return tuple(tuple(x.tolist()) for x in found)
+def with_stages(
+    structure: Structure,
+    gradients: sp.csr_array,
+    independent: Callable[[sp.csr_array], Sequence[int] | np.ndarray],
+) -> Structure:
+    """The structure with the stages of its constraints, from their gradients, and a function that
+    names rows of a matrix that are independent, as many as there are.
 
-
-def _are_shared(
-    structure: Structure, gradients: sp.csr_array, rank: Callable[[sp.csr_array], int]
-) -> bool:
-    """Whether free unknowns are in constraints of an earlier stage than the last, or in more than
-    they can meet. An unknown that is in one constraint alone is only an output, and does not
-    count; nor does one that is in one other constraint beside it, and so on."""
+    A constraint is met in the stage of its differentiation, but one that only defines an output in
+    the last: a free unknown that is in no other constraint, or in no other but those of outputs.
+    """
+    rounds = range(structure.index)
+    stages = np.repeat(rounds, [len(structure.left(k)) for k in rounds])
     rows, columns = sp.coo_array(gradients).coords
     is_free = np.isin(columns, structure.free)
     rows, columns = rows[is_free], columns[is_free]
     for _ in range(_MOST_OUTPUTS):
         alone = (np.bincount(columns) == 1)[columns]
+        stages[rows[alone]] = structure.index - 1
         others = ~np.isin(rows, rows[alone])
         rows, columns = rows[others], columns[others]
     rows, columns = np.unique(rows), np.unique(columns)
-    is_early = np.any(structure.stages[rows] < structure.index - 1)
-    return bool(is_early) or rank(gradients[rows][:, columns]) < rows.size
+    is_early = np.any(stages[rows] < structure.index - 1)
+    shared = bool(is_early) or len(independent(gradients[rows][:, columns])) < rows.size
+    seen, found = np.zeros(structure.size, bool), []
+    for k in rounds:
+        part = gradients[np.flatnonzero(stages == k)]
+        contained = np.bincount(part.indices, minlength=structure.size) > 0
+        found.append(tuple(np.flatnonzero(contained & ~seen).tolist()))
+        if len(independent(part[:, list(found[-1])])) < part.shape[0]:
+            shared = structure.shares_free or structure.determines_free
+            return dataclasses.replace(structure, is_shared=shared)
+        seen |= contained
+    given = tuple(stages.tolist()), tuple(found)
+    return dataclasses.replace(structure, stages=given[0], new_unknowns=given[1], is_shared=shared)
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.

@@ -327,3 +327,28 @@ def test_an_output_changes_no_consistent_state(name, speed):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e3 * EPS)
     slopes = dfc.DAE(residual=pendulum).term.vf(0.0, alone, None)
     np.testing.assert_allclose(output, OUTPUTS[name](alone, slopes), rtol=0, atol=1e3 * EPS)
+
+
+def test_a_multiplier_of_a_norm_keeps_the_positions():
+    """A rod on a joint, whose direction is a unit vector with a multiplier, of index 2 beside the
+    joint of index 3: wrong velocities do not move positions that are right."""
+
+    def rod(t, y, dy, args):
+        (x, p, v, w, joint, norm), (dx, dp, dv, dw, *_) = y, dy
+        along, across = 0.5 * p, jnp.array([-p[1], p[0]])
+        return (
+            dx - v,
+            dp - w * across - norm * p,
+            dv - joint - jnp.array([0.0, -9.81]),
+            dw + 3 * (along[0] * joint[1] - along[1] * joint[0]),
+            x - along,
+            p @ p - 1,
+        )
+
+    x, p, w = jnp.array([0.3, -0.4]), jnp.array([0.6, -0.8]), jnp.array(1.0)
+    zero = jnp.zeros(2)
+    found = dfc.DAE(residual=rod).consistent((x, p, jnp.array([0.2, 0.5]), w, zero, jnp.array(0.0)))
+    for now, before in zip(found, (x, p), strict=False):
+        np.testing.assert_allclose(now, before, rtol=4 * EPS)
+    np.testing.assert_allclose(found[2], found[3] * jnp.array([0.4, 0.3]), rtol=1e-14)
+    np.testing.assert_allclose(found[5], 0, atol=1e-14)
