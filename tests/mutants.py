@@ -367,12 +367,6 @@ def solve_for_slopes_whose_coefficients_vanish_at_rest(package):
     package.around("usual")(lambda old, at_rest, values: values)
 
 
-def give_shared_unknowns_large_units(package):
-    @package.around("with_stages")
-    def _(old, *given):
-        return dataclasses.replace(old(*given), is_shared=False)
-
-
 def meet_all_constraints_at_once(package):
     @package.around("with_stages")
     def _(old, *given):

@@ -569,10 +569,14 @@ def with_stages(
     for k in rounds:
         part = gradients[np.flatnonzero(stages == k)]
         contained = np.bincount(part.indices, minlength=structure.size) > 0
-        found.append(tuple(np.flatnonzero(contained & ~seen).tolist()))
-        if len(independent(part[:, list(found[-1])])) < part.shape[0]:
+        new = np.flatnonzero(contained & ~seen)
+        is_met = len(independent(part[:, new])) == part.shape[0]
+        # Shared unknowns have no unit, so that a stage must determine all that it moves.
+        free = np.intersect1d(new, structure.free) if shared else new[:0]
+        if not is_met or len(independent(part[:, free])) < free.size:
             shared = structure.shares_free or structure.determines_free
             return dataclasses.replace(structure, is_shared=shared)
+        found.append(tuple(new.tolist()))
         seen |= contained
     given = tuple(stages.tolist()), tuple(found)
     return dataclasses.replace(structure, stages=given[0], new_unknowns=given[1], is_shared=shared)
