@@ -473,11 +473,11 @@ def _is_linear(
 
 
 def _nonlinear(by_slopes: Callable[[Array], Array], t: Array, y: Array) -> Bool[np.ndarray, " n"]:
-    """The slopes on which `∂F/∂y'` depends."""
-    _, _, (slopes, others) = general_states(t, y, 0.0)
-    first = np.asarray(by_slopes(slopes))
-    moved = (by_slopes(slopes.at[j].set(others[j])) for j in range(y.size))
-    return np.array([not np.array_equal(first, np.asarray(x)) for x in moved])
+    """The slopes on which `∂F/∂y'` depends. As second derivatives are symmetric, they are those of
+    which a column changes with the slopes."""
+    _, _, slopes = general_states(t, y, 0.0)
+    first, second = (np.asarray(by_slopes(x)) for x in slopes)
+    return np.any(first != second, axis=0)
 
 
 def _with_elimination(
@@ -578,8 +578,9 @@ def with_stages(
             return dataclasses.replace(structure, is_shared=shared)
         found.append(tuple(new.tolist()))
         seen |= contained
-    given = tuple(stages.tolist()), tuple(found)
-    return dataclasses.replace(structure, stages=given[0], new_unknowns=given[1], is_shared=shared)
+    return dataclasses.replace(
+        structure, stages=tuple(stages.tolist()), new_unknowns=tuple(found), is_shared=shared
+    )
 
 
 # What a search evaluates is compiled once for the equations, and then serves all numbers.
