@@ -17,7 +17,7 @@ import scipy.sparse as sp
 from jax.experimental.sparse import BCOO
 from jaxtyping import Array, Bool, Float, PyTree
 
-from .._constants import MAX_STEPS, MIN_KLU
+from .._constants import MAX_STEPS, MIN_KLU, TOLERANCE_IN_EPS
 from .._custom_types import Args, Manifold, RealScalarLike, Values, Y
 from .._fast.run_once import RunOnce
 from .._hashable import Hashable
@@ -700,10 +700,14 @@ def _consistent(
     guess = ravel(y)
     none = jnp.zeros(count, guess.dtype)
     # What should be zero would have no tolerance, if it were compared with its own size alone.
-    little = eps_of(guess)
+    little = eps_of(guess) * jnp.abs(guess)
     shared = structure.is_shared and (large is None or large.along is not None)
     in_stages = flags is None and not (shared and large is not None)
     algebraic = structure.algebraic if structure.is_shared else structure.free
+
+    def with_zeros(found: Array) -> Array:
+        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * eps_of(guess) * little
+        return found - lax.stop_gradient(jnp.where(is_zero, found, 0))  # keeps its derivative
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage
@@ -711,18 +715,16 @@ def _consistent(
         cancellation = cancellation_scale(manifold, t, y, args)[2]
         vector, moving = ravel(y), moving & ~fixed
         least = None if large is None else least_exact(vector.dtype)
-        problem = problem_of(
-            manifold, none, t, y, args, cancellation, atol=least, changes=little * jnp.abs(guess)
-        )
+        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least, changes=little)
         sizes = moving.astype(vector.dtype)
         if shared:
             still = ~moving if large is None else fixed
-            found = _nearest(dae, structure, problem, vector, sizes, still, MAX_NEWTON_STEPS)
-            return unravel(found.y, y), found.ok
+            solved = _nearest(dae, structure, problem, vector, sizes, still, MAX_NEWTON_STEPS)
+            return unravel(with_zeros(solved.y), y), solved.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1], algebraic)
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
         found, info = SimplifiedNewton(max_steps=MAX_NEWTON_STEPS).solve(problem, vector)
-        return unravel(found, y), info.ok
+        return unravel(with_zeros(found), y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.

@@ -564,6 +564,7 @@ def with_stages(
         rows, columns = rows[others], columns[others]
     rows, columns = np.unique(rows), np.unique(columns)
     is_early = np.any(stages[rows] < structure.index - 1)
+    is_first = np.any(stages[rows] == 0)  # with the positions, as the voltage of cells is
     shared = bool(is_early) or len(independent(gradients[rows][:, columns])) < rows.size
     seen, found = np.zeros(structure.size, bool), []
     for k in rounds:
@@ -573,7 +574,8 @@ def with_stages(
         is_met = len(independent(part[:, new])) == part.shape[0]
         # Shared unknowns have no unit, so that a stage must determine all that it moves.
         free = np.intersect1d(new, structure.free) if shared else new[:0]
-        if not is_met or len(independent(part[:, free])) < free.size:
+        is_met = is_met and len(independent(part[:, free])) == free.size
+        if not is_met or (shared and is_first):
             shared = structure.shares_free or structure.determines_free
             return dataclasses.replace(structure, is_shared=shared)
         found.append(tuple(new.tolist()))
