@@ -699,14 +699,15 @@ def _consistent(
     count, large = sum(len(structure.left(k)) for k in range(structure.index)), structure.large
     guess = ravel(y)
     none = jnp.zeros(count, guess.dtype)
-    # What should be zero would have no tolerance, if it were compared with its own size alone.
-    little = eps_of(guess) * jnp.abs(guess)
+    # What should be zero would have no tolerance, if it were compared with its own size alone. So
+    # this share of the guess counts as zero, in float32 too, where tiny currents have all digits.
+    negligible = float(np.finfo(float).eps) ** 2 * jnp.abs(guess)
     shared = structure.is_shared and (large is None or large.along is not None)
     in_stages = flags is None and not (shared and large is not None)
     algebraic = structure.algebraic if structure.is_shared else structure.free
 
     def with_zeros(found: Array) -> Array:
-        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * eps_of(guess) * little
+        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * negligible
         return found - lax.stop_gradient(jnp.where(is_zero, found, 0))  # keeps its derivative
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
@@ -715,7 +716,8 @@ def _consistent(
         cancellation = cancellation_scale(manifold, t, y, args)[2]
         vector, moving = ravel(y), moving & ~fixed
         least = None if large is None else least_exact(vector.dtype)
-        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least, changes=little)
+        changes = negligible / eps_of(guess)
+        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least, changes=changes)
         sizes = moving.astype(vector.dtype)
         if shared:
             still = ~moving if large is None else fixed

@@ -354,3 +354,17 @@ def test_a_multiplier_of_a_norm_keeps_the_positions():
         np.testing.assert_allclose(now, before, rtol=4 * EPS)
     np.testing.assert_allclose(found[2], found[3] * jnp.array([0.4, 0.3]), rtol=1e-14)
     np.testing.assert_allclose(found[5], 0, atol=1e-14)
+
+
+def test_a_tiny_output_in_single_precision_keeps_its_digits():
+    """Also where the guess is many powers of ten too large."""
+
+    def pendulum(t, y, dy, share):
+        (q, v, force, output), (dq, dv, *_) = y, dy
+        gravity = jnp.array([0.0, -9.81], q.dtype)
+        return dq - v, dv + force * q - gravity, jnp.sum(q**2) - 1, output - share * force
+
+    q, one = jnp.array([0.6, -0.8], jnp.float32), jnp.float32(1)
+    share = jnp.float32(1e-20)
+    found = dfc.DAE(residual=pendulum).consistent((q, 0 * q, 0 * one, one), args=share)
+    np.testing.assert_allclose(found[3], 7.848e-20, rtol=1e-6)
