@@ -116,9 +116,11 @@ class _Nearest(AbstractSystem):
         y = self.candidate + unknowns
         return y, self.problem.residual(y)
 
-    def solve_linearised(self, solved: Solved, t_equations: tuple[Array, Array]) -> Array:
+    def solve_linearised(
+        self, solved: Solved, unknowns: Float[Array, " n"], t_equations: tuple[Array, Array]
+    ) -> Array:
         t_y, t_g = t_equations
-        y = self.candidate + self.linearisation_point(solved)
+        y = self.candidate + unknowns
         return t_y - self.corrections.linear(self.corrections.linearise(self.problem, y)[1], t_g)
 
 

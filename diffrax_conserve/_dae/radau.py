@@ -194,7 +194,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 stages, by the eigenvectors of `A⁻¹`."""
                 vectors, to_modes = (jnp.asarray(x, pair_dtype) for x in (_VECTORS, _TO_MODES))
                 modes = -to_modes @ residuals
-                first, second = real(modes[0].real), pair(modes[1])
+                first = real(modes[0].real)
+                second = pair(modes[1], after=first)
                 other = 2 * (vectors[:, 1, None] * second).real
                 return vectors[:, 0, None].real * first + other
 

@@ -24,7 +24,7 @@ from .._large.klu import (
     sparse_jacobian,
     why_not,
 )
-from .._numerics.linear import lu_factors, lu_solution
+from .._numerics.linear import computed_after, lu_factors, lu_solution
 from .newton import solve_equilibrated
 
 # `F(t, y, y')` of vectors.
@@ -65,10 +65,17 @@ class DenseSystems(NamedTuple):
         """The solutions of linear systems with a real and with a complex share, and a function that
         ends them: it returns its results once the `last` real solution is known.
 
-        `real(b, after)` is computed after another solution, on which `b` must depend otherwise."""
-        first, second = (lu_factors(share * self.by_slope + self.by_y) for share in (real, pair))
-        solve = lambda b, after=None: lu_solution(first, b)  # noqa: E731
-        return solve, ft.partial(lu_solution, second), lambda last, *results: results
+        A solution of `b` is computed `after` another, on which `b` must depend otherwise."""
+        first = lu_factors(real * self.by_slope + self.by_y)
+        second = lu_factors(computed_after(pair * self.by_slope + self.by_y, first[0]))
+
+        def solver(factors: tuple[Array, Array]) -> Solve:
+            def solve(b: Array, after: Array | None = None) -> Array:
+                return lu_solution(factors, b if after is None else computed_after(b, after))
+
+            return solve
+
+        return solver(first), solver(second), lambda last, *results: computed_after(results, last)
 
 
 class SparseSystems(NamedTuple):

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from .._tree import tree_tangents, unflatten
 from .closures import ClosureConverted
 from .iterate import Solved, simplified_newton
+from .linear import computed_after
 from .problem import Problem
 from .rows import AbstractRows
 
@@ -44,7 +45,7 @@ class AbstractSystem(eqx.Module):
         """`F` at these unknowns. Only its tangent by the arrays of the system is used."""
 
     @abc.abstractmethod
-    def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
+    def solve_linearised(self, solved: Solved, unknowns: Any, t_equations: Any) -> Any:
         """The tangent of what the iteration returns: that of `x` is `-(∂F/∂x)⁻¹ t_equations`."""
 
 
@@ -60,7 +61,7 @@ def _solution_jvp(primals: Any, tangents: Any) -> Any:
     solved = implicit_solution(system)
     x = system.linearisation_point(solved)
     values, t_values = eqx.filter_jvp(lambda system: system.equations(x), (system,), (t_system,))
-    tangent = system.solve_linearised(solved, tree_tangents(values, t_values))
+    tangent = system.solve_linearised(solved, x, tree_tangents(values, t_values))
     none = jtu.tree_map(lambda _: None, solved)
     return solved, none._replace(y=tangent)
 
@@ -116,7 +117,7 @@ class MultiplierSystem(AbstractSystem):
     def linearisation_point(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
-        start = self._start(solved.ok)
+        start = computed_after(self._start(solved.ok), solved.y)
         row_norms, rows = self._directions_at(start).normalised()
         change = self.problem.factor.to_euclidean(jnp.where(solved.ok, solved.y, start) - start)
         return solved.ok, rows.least_squares_multiplier(change) / row_norms
@@ -133,12 +134,14 @@ class MultiplierSystem(AbstractSystem):
         # Both are evaluated at the state, so that the tangent of `g` contains that of the state.
         return end, self.problem.residual(end)
 
-    def solve_linearised(self, solved: Solved, t_equations: tuple[Array, Array]) -> Array:
+    def solve_linearised(
+        self, solved: Solved, unknowns: tuple[Array, Array], t_equations: tuple[Array, Array]
+    ) -> Array:
         """With `ẏ` and `ġ` for the tangents of both equations at constant `λ`, `G(y) S Uᵀ λ̇ = -ġ`,
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
         t_y, t_g = t_equations
         problem, start = self.problem, self._start(solved.ok)
-        y = jnp.where(solved.ok, solved.y, start)
+        y = computed_after(jnp.where(solved.ok, solved.y, start), unknowns[1])
         row_norms, rows = problem.gradients(y).normalised()
         directions = self._directions_at(start).normalised()[1]
         change = rows.gram(directions).row_space_correction(
@@ -185,10 +188,11 @@ class SquareSystem(AbstractSystem):
     def equations(self, unknowns: Any) -> Any:
         return self.residual(unknowns)
 
-    def solve_linearised(self, solved: Solved, t_equations: Any) -> Any:
-        x = self.linearisation_point(solved)
-        matrix = self.jacobian(lambda flat: _flat(self.residual(unflatten(flat, x))))
-        return unflatten(self.solve(matrix(_flat(x)), -_flat(t_equations)), x)
+    def solve_linearised(self, solved: Solved, unknowns: Any, t_equations: Any) -> Any:
+        flat = _flat(unknowns)
+        matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, unknowns))))(flat)
+        matrix = computed_after(matrix, unknowns)
+        return unflatten(self.solve(matrix, -_flat(t_equations)), unknowns)
 
 
 def root(

@@ -17,6 +17,21 @@ from .._tree import eps_of
 Solve = Callable[[Float[Array, " m"]], Float[Array, " m"]]
 
 
+def computed_after(x: Any, known: Any) -> Any:
+    """The arrays of a PyTree, computed after those of another.
+
+    In a batch the calls of LAPACK in jaxlib 0.10 wait for their parts in the pool of threads in
+    which they run. If as many run at once as there are threads, they wait for ever: on two cores
+    two suffice. So in a program of ours no call is independent of another. XLA computes zero times
+    a number, as it might be NaN, and here it is none.
+    """
+    for leaf in jtu.tree_leaves(lax.stop_gradient(known)):
+        one = jnp.ravel(leaf)[0].real
+        zero = 0 * jnp.where(jnp.isfinite(one), one, 0)
+        x = jtu.tree_map(lambda x, zero=zero: x + zero.astype(x.dtype), x)
+    return x
+
+
 def lu_factors(matrix: Inexact[Array, "m m"]) -> tuple[Array, Array]:
     """`L` and `U` in one matrix, and the permutation of the rows. `jax.scipy.linalg` keeps the
     pivots instead, and each of its solves finds the permutation again, by a loop."""
