@@ -34,6 +34,7 @@ class FeatureBasis(NamedTuple):
     slopes: Float[np.ndarray, "points wide"]  # q_k
     integrals: Float[np.ndarray, "points wide"]  # of q_k, from 0
     fit: Float[np.ndarray, "wide points"]  # values to the coefficients of the least-squares fit
+    last: Float[np.ndarray, "2 points"]  # values to the last two Legendre coefficients
     series: Float[np.ndarray, "degrees wide"]  # the integrals, as Chebyshev series in 2 s - 1
 
 
@@ -47,6 +48,8 @@ def feature_basis(count: int) -> FeatureBasis:
     root = np.sqrt(weights / 2)[:, None]
     # The members are orthonormal for the Gauss rule up to roundoff, which the inverse removes.
     fit = np.linalg.pinv(root * slopes) * root.T
+    degrees = np.arange(2 * count)[-2:]
+    last = np.sqrt(2 * degrees + 1) * legendre.legvander(points, degrees[-1])[:, degrees]
     nodes = 2 * count + 8
     values = legendre.legval(2 * chebyshev_points(nodes) - 1, integrated).T
     return FeatureBasis(
@@ -55,6 +58,7 @@ def feature_basis(count: int) -> FeatureBasis:
         slopes,
         legendre.legval(points, integrated).T,
         fit,
+        last.T * weights / 2,
         to_coefficients(nodes) @ values,
     )
 
