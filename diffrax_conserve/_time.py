@@ -1,6 +1,9 @@
-"""The times of a step: as those of the vector field, and their difference as a divisor."""
+"""The times of a step: as those of the vector field, as what is traced, and their difference as a
+divisor."""
 
-from typing import final
+import functools as ft
+from collections.abc import Callable
+from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,6 +24,28 @@ class FieldTime(eqx.Module):
 
     def __call__(self, t: RealScalarLike) -> RealScalarLike:
         return t * self.direction
+
+
+def traced_once(step: Callable[..., Any]) -> Callable[..., Any]:
+    """The `step` of a solver, compiled once for all times: diffrax alone traces it three times. In
+    a loop by hand times are Python's numbers, which `filter_jit` takes for parts of the program."""
+    compiled = eqx.filter_jit(step)
+
+    @ft.wraps(step)
+    def at_times(
+        self: Any,
+        terms: Any,
+        t0: RealScalarLike,
+        t1: RealScalarLike,
+        y0: Any,
+        args: Any,
+        solver_state: Any,
+        made_jump: Any,
+    ) -> Any:
+        times = (jnp.asarray(1.0 * t) for t in (t0, t1))
+        return compiled(self, terms, *times, y0, args, solver_state, made_jump)
+
+    return at_times
 
 
 def nonzero_length(t0: RealScalarLike, t1: RealScalarLike) -> Float[Array, ""]:

@@ -37,7 +37,7 @@ from .._projection.options import check_state, option
 from .._solver.failure import failure_cause, nan_if_failed, starts_off_manifold
 from .._solver.state import StepFingerprint, initial_values
 from .._solver.terms import in_field_time, is_backsolve, vector_fields
-from .._time import nonzero_length
+from .._time import nonzero_length, traced_once
 from .._tree import eps_of, ravel, tree_shapes, unflatten, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -203,7 +203,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
                 f"The positions have the shapes {tree_shapes(q)}, the velocities "
                 f"{tree_shapes(v)}. `RATTLE` needs a state `(q, v)` of two parts that are alike."
             )
-        terms, t0 = in_field_time(terms, t0)
+        terms, t0 = in_field_time(terms, 1.0 * t0)
         _, cancellation = initial_values(self.constraint, t0, q, args)
         at, slope, off = self._started(terms, t0, y0, args, cancellation)
         end = StepFingerprint.before_first(self.constraint, cancellation.dtype)
@@ -229,7 +229,7 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         off = off | starts_off_manifold(problem, self.constraint, ravel(q))
         return at, terms[1].vf(t0, q, args), off
 
-    @eqx.filter_jit  # traced once; diffrax alone traces a step three times
+    @traced_once
     def step(
         self,
         terms: PyTree[dfx.AbstractTerm],

@@ -37,6 +37,7 @@ from .._solver.state import initial_values
 from .._solver.statistics import ProjectionStatistics
 from .._solver.terms import check_root_finder, in_field_time, innermost, refuse_backsolve
 from .._solver.wrapper import ForwardingSolver
+from .._time import traced_once
 from .._tree import eps_of, ravel, unravel
 from .shorter_step import ShorterStep, StepOf
 
@@ -153,7 +154,7 @@ class SymmetricProjection(ForwardingSolver):
         inner = self.solver.init(terms, t0, t1, y0, args)
         return _State(inner, values, cancellation, jnp.zeros_like(values), statistics)
 
-    @eqx.filter_jit  # traced once; diffrax alone traces a step three times
+    @traced_once
     def step(
         self,
         terms: PyTree[dfx.AbstractTerm],

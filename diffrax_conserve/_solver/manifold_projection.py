@@ -23,7 +23,7 @@ from .._options import check_number
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, option
 from .._projection.simplified_newton import SimplifiedNewton
-from .._time import FieldTime
+from .._time import FieldTime, traced_once
 from .._tree import ravel, tree_add, unravel
 from .failure import (
     error_for_controller,
@@ -209,7 +209,7 @@ class ManifoldProjection(ForwardingSolver):
             else None,
         )
 
-    @eqx.filter_jit  # traced once; diffrax alone traces a step three times
+    @traced_once
     def step(
         self,
         terms: PyTree[dfx.AbstractTerm],

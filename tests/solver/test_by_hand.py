@@ -64,3 +64,44 @@ def test_a_step_that_is_too_long_is_told_by_its_result(solver, reason):
         result = solver.step(term, 0.0, end, y0, None, state, made_jump=False)[4]
         assert bool(dfx.is_successful(result)) == succeeds
     assert reason in str(result)
+
+
+def both_ways(change):
+    return dfx.ODETerm(lambda t, v, args: v), dfx.ODETerm(change)
+
+
+@pytest.mark.parametrize(
+    ("make", "terms", "y"),
+    [
+        (lambda: SOLVER, dfx.ODETerm, jnp.array([1.0, 0.0])),
+        (
+            lambda: dfc.SymmetricProjection(dfc.ImplicitMidpoint(), ENERGY),
+            dfx.ODETerm,
+            jnp.array([1.0, 0.0]),
+        ),
+        (
+            lambda: dfc.RATTLE(dfc.Constraint(lambda t, q, args: q @ q - 1), masses=1.0),
+            both_ways,
+            (jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])),
+        ),
+        (lambda: unchecked(flow_map()), dfx.ODETerm, LORENZ.y0),
+    ],
+    ids=["projection", "symmetric", "RATTLE", "flow map"],
+)
+def test_a_loop_at_times_of_python_compiles_once(make, terms, y):
+    """Also of integers, and at times of which none comes twice."""
+    traces = []
+
+    def change(t, y, args):
+        traces.append(t)
+        return -y if args is None else jnp.stack([y[1], args - jnp.sin(y[0])])
+
+    solver, args = make(), 0.1 if terms is dfx.ODETerm and len(y) == 2 else None
+    terms, counts = terms(change), []
+    state = solver.init(terms, 0, TICK, y, args)
+    for k in range(4):
+        start, end = (k * TICK, (k + 1) * TICK) if k != 3 else (1, 1.2)
+        y, _, _, state, result = solver.step(terms, start, end, y, args, state, made_jump=False)
+        assert dfx.is_successful(result)
+        counts.append(len(traces))
+    assert counts[1] == counts[3]

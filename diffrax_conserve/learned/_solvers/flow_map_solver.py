@@ -14,6 +14,7 @@ from jaxtyping import Array
 from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike, Y
 from ..._hashable import Hashable
 from ..._projection.options import option
+from ..._time import traced_once
 from .._networks.flow_map import AbstractFlowMap, args_domain_of, as_flow_map, known_args
 from .checks import Refused, check_learned_terms, check_output, refused_from_start, with_result
 from .collocation import (
@@ -126,7 +127,7 @@ class DeepONetSolver(Hashable, dfx.AbstractSolver[_State]):
         refused = refused_from_start(self.flow_map, known, self.check_field, *given)
         return _State(refused, StepsOutside.zero(t0) if self._has_domain else None)
 
-    @eqx.filter_jit  # with a traced length, one that is too long is told by the result
+    @traced_once  # with a traced length, one that is too long is told by the result
     def step(
         self,
         terms: dfx.AbstractTerm,

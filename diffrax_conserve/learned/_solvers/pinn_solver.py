@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import ClassVar, final
 
 import diffrax as dfx
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array
@@ -13,6 +12,7 @@ from ..._custom_types import VF, Args, BoolScalarLike, DenseInfo, RealScalarLike
 from ..._hashable import Hashable
 from ..._solver.diffrax_private import register, result_at
 from ..._solver.terms import in_field_time
+from ..._time import traced_once
 from ..._tree import eps_of, tree_sub
 from .._networks.flat import flatten, working_dtype
 from .._networks.pinn import PINN
@@ -85,7 +85,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
         starts = jnp.all(jnp.abs(flatten(tree_sub(y0, state))) <= tolerance * size)
         return jnp.where(self._covers(time), jnp.where(starts, 0, _ANOTHER_START), _OUTSIDE)
 
-    @eqx.filter_jit  # with a traced time, one that is outside is told by the result
+    @traced_once  # with a traced time, one that is outside is told by the result
     def step(
         self,
         terms: dfx.AbstractTerm,
