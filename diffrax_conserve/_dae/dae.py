@@ -29,6 +29,7 @@ from .._numerics.metric import Diagonal
 from .._numerics.problem import Problem, problem_of
 from .._numerics.report import ProjectionInfo
 from .._numerics.roundoff import cancellation_scale
+from .._numerics.rows import DenseRows
 from .._options import check_function
 from .._projection.base import AbstractProjection, check_projection
 from .._projection.options import check_state, refuse_half_precision
@@ -43,11 +44,12 @@ from .newton import (
     SparseNewton,
     algebraic_newton,
     error_oriented_newton,
+    implied_by_others,
     least_exact,
     solve_equilibrated,
 )
 from .radau import Radau
-from .reduction import Implicit, Reduction, Singular, Structure
+from .reduction import Implicit, OtherRanks, Reduction, Singular, Structure
 from .search import MOST_DENSE, Search, any_traced, lifted, tree_key
 
 
@@ -529,14 +531,16 @@ def _checked_structure(dae: DAE, t: RealScalarLike, y: Y, args: Args) -> Structu
         except FloatingPointError:  # a poor guess tells nothing
             return structure
 
-    here = _found(dae, t, y, args, near)
-    if here.ranks != structure.ranks:
+    try:
+        _found(dae, t, y, args, near)
+    except OtherRanks:
         raise ValueError(
-            f"With these values the equations have {here}, but with values in general position "
-            f"{structure}. Where values decide, such as zeros in `args`, write "
-            "`dae = dae.at(guess, t=t0, args=args)`, and take `consistent`, `report`, `term` and "
-            "`wrap` of that."
-        )
+            "Near this state the equations determine other slopes than with values in general "
+            f"position, with which they have {structure}. Where values decide, such as zeros in "
+            "`args`, write `dae = dae.at(guess, t=t0, args=args)`, and take `consistent`, "
+            "`report`, `term` and `wrap` of that. Otherwise roundoff hides how they depend on the "
+            "unknowns: give another guess."
+        ) from None
     return structure
 
 
@@ -700,14 +704,15 @@ def _consistent(
     guess = ravel(y)
     none = jnp.zeros(count, guess.dtype)
     # What should be zero would have no tolerance, if it were compared with its own size alone. So
-    # this share of the guess counts as zero, in float32 too, where tiny currents have all digits.
-    negligible = float(np.finfo(float).eps) ** 2 * jnp.abs(guess)
+    # this share of the guess, or of what other unknowns make of it, counts as zero, in float32 too,
+    # where tiny currents have all digits.
+    share = float(np.finfo(float).eps) ** 2
     shared = structure.is_shared and (large is None or large.along is not None)
     in_stages = flags is None and not (shared and large is not None)
     algebraic = structure.algebraic if structure.is_shared else structure.free
 
-    def with_zeros(found: Array) -> Array:
-        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * negligible
+    def with_zeros(found: Array, changes: Array) -> Array:
+        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * eps_of(guess) * changes
         return found - lax.stop_gradient(jnp.where(is_zero, found, 0))  # keeps its derivative
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
@@ -716,17 +721,22 @@ def _consistent(
         cancellation = cancellation_scale(manifold, t, y, args)[2]
         vector, moving = ravel(y), moving & ~fixed
         least = None if large is None else least_exact(vector.dtype)
-        changes = negligible / eps_of(guess)
-        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least, changes=changes)
-        sizes = moving.astype(vector.dtype)
+        problem = problem_of(manifold, none, t, y, args, cancellation, atol=least)
+        sizes, size = moving.astype(vector.dtype), jnp.abs(guess)
+        if large is None:
+            rows = problem.with_dense_jacobian().linearise(vector)[1]
+            assert isinstance(rows, DenseRows)
+            size = jnp.maximum(size, implied_by_others(rows.matrix, jnp.abs(vector)))
+        changes = share / eps_of(guess) * lax.stop_gradient(size)
+        problem = dataclasses.replace(problem, changes=changes)
         if shared:
             still = ~moving if large is None else fixed
             solved = _nearest(dae, structure, problem, vector, sizes, still, MAX_NEWTON_STEPS)
-            return unravel(with_zeros(solved.y), y), solved.ok
+            return unravel(with_zeros(solved.y, changes), y), solved.ok
         units = structure.equilibrated_units(sizes, problem.linearise(vector)[1], algebraic)
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
         found, info = SimplifiedNewton(max_steps=MAX_NEWTON_STEPS).solve(problem, vector)
-        return unravel(with_zeros(found), y), info.ok
+        return unravel(with_zeros(found, changes), y), info.ok
 
     # The tolerance follows the roundoff at the guess, so the last time judges by that at the state.
     # `project` measures twice too, in two programs, and compiles nearly twice as much.

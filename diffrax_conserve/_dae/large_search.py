@@ -31,6 +31,7 @@ from .large import Large
 from .places import FindPlaces, Numbers
 from .reduction import (
     LastConstraints,
+    OtherRanks,
     Singular,
     Structure,
     WithNumbers,
@@ -119,9 +120,9 @@ def find_large_structure(
     in_places = by_slope.rows, by_slope.columns
     gradients = sp.csr_array((0, n))
     while len(selected[0]) < n:
-        before = known.rounds[structure.index :] if known is not None else ()
-        if before and len(before[0].slopes) == len(selected[0]):
-            selected = tuple(np.array(x, int) for x in before[0])
+        if known is not None:
+            one = known.selected(structure.index, len(selected[0]))
+            selected = tuple(np.array(x, int) for x in one)
         if structure.index == MAX_INDEX:
             raise NotFound(f"their index is larger than {MAX_INDEX}")
         one = Round(*map(_tuple, selected))
@@ -160,6 +161,8 @@ def find_large_structure(
         in_places = tuple(np.append(x[kept], y) for x, y in zip(in_places, added, strict=True))
         selected = extended(matrix, selected)
         needed = np.unique(at.columns[~np.isin(left[at.rows], selected[0])])
+    if known is not None and structure.index != known.index:
+        raise OtherRanks
     large = once((structure, "slopes"), lambda: _with_slopes(structure, by_y, in_places))
     part = gradients[:, structure.algebraic]
     part = part[~_empty(part, 1)]

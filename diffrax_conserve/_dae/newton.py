@@ -50,6 +50,22 @@ def row_and_column_scales(
     return rows, jnp.max(sizes / rows[:, None], axis=0)
 
 
+def implied_by_others(
+    jacobian: Float[Array, "m n"], size: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """For each unknown the least change that the largest term of another one stands for, in one of
+    the equations of both, if unknowns have these sizes; zero if there is no other."""
+    slopes = jnp.abs(jacobian)
+    terms = slopes * size
+    is_largest = jnp.arange(len(size)) == jnp.argmax(terms, axis=1, keepdims=True)
+    largest = jnp.max(terms, axis=1, keepdims=True)
+    second = jnp.max(jnp.where(is_largest, 0, terms), axis=1, keepdims=True)
+    others = jnp.where(is_largest, second, largest)
+    divisor = jnp.where(slopes > 0, slopes, 1)
+    least = jnp.min(jnp.where((slopes > 0) & (others > 0), others / divisor, jnp.inf), axis=0)
+    return jnp.where(least < jnp.inf, least, 0)
+
+
 class _Factored(NamedTuple):
     """The LU decomposition of a Jacobian in the units of its rows and columns. A single number is
     its own: a call of LAPACK would take most of the time of a small solve."""

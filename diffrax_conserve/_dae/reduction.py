@@ -130,6 +130,12 @@ class Structure:
     def __str__(self) -> str:
         return f"index {self.index} and {self.freedom} degrees of freedom"
 
+    def selected(self, k: int, count: int) -> Round:
+        """What is selected in a round, if that is so many slopes; otherwise raises `OtherRanks`."""
+        if self.ranks[k : k + 1] != (count,):
+            raise OtherRanks
+        return self.rounds[k]
+
     def left(self, k: int) -> tuple[int, ...]:
         """The equations that are left in a round, and give constraints."""
         solved = set(self.rounds[k].equations)
@@ -374,6 +380,10 @@ class Singular(ValueError):
         self.left, self.absent = left, absent
 
 
+class OtherRanks(ValueError):
+    """Equations are solved for another number of slopes than in a known structure."""
+
+
 # The equations as a function of the numbers in them, and of what an `Implicit` takes.
 WithNumbers = Callable[[Numbers, Array, Array, Array], Array]
 
@@ -391,8 +401,11 @@ def find_structure(
 ) -> Structure:
     """The structure of equations with these numbers near a state, by elimination. Whether `∂F/∂y'`
     is constant, the other numbers tell. `unknown` are the numbers that may have any values;
-    `memory` holds what does not depend on them, for the next search. While the ranks are those of
-    a known structure, what that selects is taken, for which the programs are compiled."""
+    `memory` holds what does not depend on them, for the next search.
+
+    With a `known` structure what that selects is taken, for which the programs are compiled. It
+    raises `OtherRanks` as soon as a rank is another, and `FloatingPointError` where what is
+    selected is singular, so that these numbers do not tell."""
     t, y, matrix, at_rest, is_linear, absent = _general_position(equations, numbers, t, y)
     other = matrix
     if mass is None:  # does it depend on the time, the state or parameters?
@@ -421,11 +434,11 @@ def find_structure(
     by_slopes = ft.partial(_by_slope, equations, numbers, t, y)
     eliminated = ft.partial(_with_elimination, ft.partial(_is_linear, by_slopes, t, y))
     while len((selected := _extended(matrix, selected)).equations) < y.size:
-        before = known.rounds[structure.index :] if known is not None else ()
-        if before and len(before[0].slopes) == len(selected.slopes):
-            inner = matrix[np.ix_(*before[0])]
-            if len(_extended(inner, _NO_ROUND).slopes) == len(inner):
-                selected = before[0]
+        if known is not None:
+            selected = known.selected(structure.index, len(selected.slopes))
+            inner = matrix[np.ix_(*selected)]
+            if len(_extended(inner, _NO_ROUND).slopes) < len(inner):
+                raise FloatingPointError
         structure = dataclasses.replace(structure, rounds=(*structure.rounds, selected))
         left = structure.left(structure.index - 1)
         needed = np.any(places[list(left)], axis=0)
@@ -445,6 +458,8 @@ def find_structure(
         last = LastConstraints(equations, structure)
         places = places.copy()
         places[list(left)] = find.dense(last, 1, len(left))
+    if known is not None and structure.index != known.index:
+        raise OtherRanks
     every = tuple(range(y.size))
     structure = eliminated(structure, places, Round(every, every), np.full(y.size, True))
     if not is_linear:
@@ -684,7 +699,9 @@ def general_states(t: Array, y: Array, share: float | Array) -> tuple[Array, Arr
     """A time and a state at this relative distance, and two slopes."""
     pattern = irregular_weights(3 * y.size + 1, y.dtype)
     largest = jnp.max(jnp.abs(y), initial=0)
-    size = jnp.where(y == 0, jnp.where(largest > 0, largest, 1), jnp.abs(y))
+    # A zero has no unit: it moves with the others, but not far if these are large.
+    at_zero = jnp.where(largest > 0, jnp.minimum(largest, 1), 1)
+    size = jnp.where(y == 0, at_zero, jnp.abs(y))
     moved = y + share * size * (1 + pattern[: y.size] / 2)
     later = t + share * (1 + pattern[-1] / 2) * jnp.where(t == 0, 1, jnp.abs(t))
     return later, moved, size * pattern[:-1].reshape(3, -1)[1:]

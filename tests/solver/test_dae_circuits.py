@@ -128,6 +128,35 @@ def test_a_virtual_ground_has_not_moved(copies):
     assert largest(y[1]) < 1e-15
 
 
+def differentiator(t, y, slopes, args):
+    """As above, without a load, and with units as in a textbook: exact are `0, 0, -1, -1, 1`."""
+    v_in, ground, v_out, i_in, i_out = y
+    charging, back = slopes[0] - slopes[1], v_out - ground
+    return jnp.stack([i_in + charging, -charging - back, back + i_out, v_in - jnp.sin(t), ground])
+
+
+def controlled(t, y, slopes, args):
+    """A pendulum hangs where a controller measures zero and pushes with a force of two."""
+    q, v, (tension, measured, push) = y[:2], y[2:4], y[4:]
+    forces = jnp.stack([push, -9.81]) - tension * q
+    outputs = jnp.stack([measured - q[0], push - 4 * (0.5 - measured)])
+    return jnp.concatenate([slopes[:2] - v, slopes[2:4] - forces, (q @ q - 1)[None], outputs])
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize(
+    ("residual", "guess", "exact"),
+    [
+        (differentiator, jnp.zeros(5), [0, 0, -1, -1, 1]),
+        (controlled, jnp.zeros(7).at[1].set(-1), [0, -1, 0, 0, 9.81, 0, 2]),
+    ],
+)
+def test_a_zero_beside_what_is_not_is_found_from_zero(residual, guess, exact, dtype):
+    """Roundoff of the others leaves it at a number that no size of its own says is zero."""
+    found = dfc.DAE(residual=residual).consistent(guess.astype(dtype))
+    np.testing.assert_allclose(found, exact, rtol=4 * jnp.finfo(dtype).eps)
+
+
 def test_an_output_of_a_nonlinear_slope():
     """`y = p³ + p`, `p = y'`: `3/2 p² + log p - t` is constant. A first Jacobian at slopes of zero
     would be a third of that at the slope, at which Newton's method diverges in any step."""

@@ -232,7 +232,7 @@ test_mistakes_are_named = refused(
     (
         lambda: decided().consistent(GUESS, args=jnp.zeros(())),
         ValueError,
-        r"index 1 and 1 degrees of freedom.*index 0 and 2.*dae.at\(",
+        r"other slopes.*index 0 and 2.*dae.at\(",
     ),
 )
 
