@@ -87,7 +87,8 @@ def test_errors_and_drifts_are_those_of_the_closed_form(capsys):
 def test_that_a_projection_hurts_is_told(capsys):
     report = compared(0.0, 1.3, capsys)
     assert report.choice == "nothing kept"
-    assert report.verdict.startswith("Do not project: with `all kept")
+    assert report.verdict.startswith("Do not project: `manifold` is not conserved; with `all kept")
+    assert "its drift along the reference is 0." in " ".join(report.notes)
     assert isinstance(report.solver, dfc.RK4)
 
 

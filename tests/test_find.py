@@ -200,6 +200,24 @@ test_mistakes_are_named = refused(
 )
 
 
+def test_an_invariant_is_found_beside_another_that_is_nearly_conserved():
+    """Hénon and Heiles with a coefficient near 6, with which there is a second one of degree four.
+    The energy alone is exact, to all digits."""
+
+    def field(t, y, args):
+        return jnp.stack(
+            [y[2], y[3], -y[0] - 2 * y[0] * y[1], -y[1] - y[0] ** 2 - 6.001 * y[1] ** 2]
+        )
+
+    def energy(y):
+        return jnp.sum(y**2) / 2 + y[0] ** 2 * y[1] + 6.001 / 3 * y[1] ** 3
+
+    states = jr.uniform(jr.key(7), (400, 4), minval=-1.0)
+    (found,) = find_invariants(field, states, basis=4).values()
+    ratio = jax.vmap(lambda y: found.fn(0.0, y, None) / energy(y))(states)
+    np.testing.assert_allclose(ratio, 3 / 6.001, rtol=1e-11)
+
+
 def test_what_cannot_be_told_apart_is_left_out_with_a_warning():
     def nearly(t, y, args):
         return jnp.stack([-y[0], y[0], -y[2], y[2] + 2e-14 * y[3]])

@@ -24,7 +24,7 @@ from .._options import ONE_STATE, check_counts, check_float64, check_number, dty
 from .._projection.base import AbstractProjection
 from .._solver.manifold_projection import ManifoldProjection
 from .check_invariance import entries_of
-from .compared_solves import Task, drifts, references, sizes_of, switched, timed
+from .compared_solves import Task, drifts, not_conserved, references, sizes_of, switched, timed
 from .comparison import (
     NOTHING,
     WORSE,
@@ -346,6 +346,7 @@ def _report(
     invariants = linear_invariants(field, jnp.asarray(ts), exact, sizes, task.args, entries)
     states = lambda sols: jtu.tree_map(lambda x: np.asarray(x)[:, :length], sols.ys)  # noqa: E731
 
+    changing = not_conserved(plain, exact, rough, entries, task.args)
     counted = judged(states(plain), exact)
 
     def told(variant: _Variant, sols: dfx.Solution, seconds: float) -> tuple[ComparisonRow, Any]:
@@ -363,7 +364,8 @@ def _report(
 
     def report_of(found: list[tuple[ComparisonRow, Any]]) -> ComparisonReport:
         rows = tuple(row for row, _ in found)
-        report = ComparisonReport(rows, ts, distance(rough, exact, counted), len(invariants))
+        doubt = distance(rough, exact, counted)
+        report = ComparisonReport(rows, ts, doubt, len(invariants), changing)
         beside = ft.partial(worsened, found[0][1], exact, rough, report.last)
         rows = (dataclasses.replace(row, worsened=beside(ys)) for row, ys in found)
         return dataclasses.replace(report, rows=tuple(rows))

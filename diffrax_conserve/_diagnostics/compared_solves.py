@@ -35,6 +35,8 @@ _CANCELLED = 1e-2
 _SMALL = 1e-3
 # By these shares of themselves components are varied, to see the terms of a slope.
 _VARIED = 2.0**-10
+# An entry that changes less along the reference counts as conserved.
+_CHANGES = 1e-8
 # The reference takes at most so many steps from a time to the next. An explicit method reaches them
 # where the field is stiff.
 _REFERENCE_STEPS = 20_000
@@ -213,3 +215,26 @@ def drifts(task: Task, sols: dfx.Solution, entries: dict[str, Any]) -> dict[str,
     if not task.saveat.dense:  # then only the states are needed, which all solvers have alike
         sols = dataclasses.replace(sols, interpolation=None, stats={})
     return {name: np.asarray(x) for name, x in _drifts(sols, entries, task.args).items()}
+
+
+def not_conserved(
+    sols: dfx.Solution, exact: Any, rough: Any, entries: dict[str, Any], args: Args
+) -> dict[str, float]:
+    """The drifts of the entries that change along the exact solution: as much as along a rough one,
+    with errors a hundred times as large, and more than roundoff. Entries with a rate or a value are
+    left out: they change, or are not those of the start."""
+    plain = {
+        name: entry
+        for name, entry in entries.items()
+        if isinstance(entry, Constraint) or (entry.value is None and entry.rate is None)
+    }
+    if not plain:
+        return {}
+    length = jtu.tree_leaves(exact)[0].shape[1]
+    sols = dataclasses.replace(sols, ts=sols.ts[:, :length], interpolation=None, stats={})
+    first, second = (
+        _drifts(dataclasses.replace(sols, ys=jtu.tree_map(jnp.asarray, ys)), plain, args)
+        for ys in (exact, rough)
+    )
+    found = {name: (np.max(first[name]), np.max(second[name])) for name in plain}
+    return {name: float(a) for name, (a, b) in found.items() if a > max(_CHANGES, b / 2)}

@@ -169,12 +169,14 @@ class ComparisonReport:
     - `ts`: the times at which states were compared.
     - `doubt`: how far the two solves of the reference are apart, in each lane at each time.
     - `num_linear`: the number of linear invariants that no entry declares.
+    - `not_conserved`: the entries that change along the reference, and by which drift.
     """
 
     rows: tuple[ComparisonRow, ...]
     ts: Float[np.ndarray, " times"]
     doubt: Float[np.ndarray, "lanes times"]
     num_linear: int
+    not_conserved: dict[str, float] = dataclasses.field(default_factory=dict)
 
     # ---- What is judged ----
 
@@ -207,12 +209,18 @@ class ComparisonReport:
     def index(self) -> int | None:
         """The row to take; `None` if that cannot be said."""
         error = self.error
-        found = _chosen(error, np.array([row.worsened[1] for row in self.rows]))
+        worsened = np.array([row.worsened[1] for row in self.rows])
+        found = _chosen(error, worsened, self._is_conserved)
         if not found or not {*self.rows[found].kept} <= {*self.kept_anyway}:
             return found
         # Only bounds can gain where all entries are kept anyway.
         gain = _mean(error[found]) < (1 - _EQUAL) * _mean(error[0])
         return found if gain else 0
+
+    @property
+    def _is_conserved(self) -> list[bool]:
+        """Whether all that a row keeps is conserved."""
+        return [not {*row.kept} & {*self.not_conserved} for row in self.rows]
 
     @property
     def kept_anyway(self) -> tuple[str, ...]:
@@ -262,7 +270,10 @@ class ComparisonReport:
             return f"Do not project: every projection fails{where}."
         best = min(rivals, key=lambda i: _mean(ratios[i]))
         name = self.rows[best].name
-        told = f"Do not project: {self._until}with `{name}`, the best of the projections, "
+        lacking = [f"`{x}`" for x in self.rows[best].kept if x in self.not_conserved]
+        reason = f"{' and '.join(lacking)} {'are' if lacking[1:] else 'is'} not conserved; "
+        told = f"Do not project: {reason if lacking else ''}{self._until}with `{name}`, the best "
+        told += "of the projections, "
         return f"{told}{_compared(ratios[best])}{self._worse(best)}."
 
     def _worse(self, index: int) -> str:
@@ -291,6 +302,10 @@ class ComparisonReport:
     def notes(self) -> list[str]:
         """What else there is to know, a sentence each."""
         found = [*self._horizon(), *self._failures(), *self._broken(), *self._units()]
+        found += [
+            f"`{name}` is not conserved: its drift along the reference is {drift:.1g}."
+            for name, drift in self.not_conserved.items()
+        ]
         if self.kept_anyway:
             names = ", ".join(f"`{name}`" for name in self.kept_anyway)
             found.append(
@@ -435,10 +450,11 @@ def _mean(errors: np.ndarray) -> float:
     return _of_known(lambda x: np.exp(np.mean(np.log(x))), errors)
 
 
-def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
+def _chosen(error: np.ndarray, worsened: np.ndarray, conserved: list[bool]) -> int | None:
     """Of the rows that fail in the fewest lanes, the first with a projection of which the geometric
     mean of the errors is about the least; if none gains, the first that changes little, in every
-    component. What spoils a component must gain as much in the mean, and comes last."""
+    component, and keeps only what is conserved. What spoils a component must gain as much in the
+    mean, and comes last."""
     error = np.maximum(error[:, ~np.isnan(error).any(axis=0)], _TINY)
     failures = np.sum(np.isinf(error), axis=1)
     able = np.flatnonzero(failures == failures.min())
@@ -456,7 +472,7 @@ def _chosen(error: np.ndarray, worsened: np.ndarray) -> int | None:
     worst = {i: np.max(error[i, common] / error[0, common]) for i in means}
     gains = [i for i in near if means[i] < (1 - _EQUAL) * means[0]]
     little = [i for i in near if means[i] <= (1 + _EQUAL) * means[0]]
-    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= 1 + _EQUAL]
+    equal = [i for i in little if worst[i] <= _RISK and worsened[i] <= 1 + _EQUAL and conserved[i]]
     return next((i for i in [*gains, *equal] if i > 0), 0)
 
 

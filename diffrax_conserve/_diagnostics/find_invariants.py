@@ -326,6 +326,23 @@ class _Samples:
         terms = self.eps * float(np.linalg.norm(self.totals[states] @ np.abs(c)))
         return float(np.linalg.norm(self.derivatives[states] @ c)) / (terms or 1.0)
 
+    def refined(self, c: np.ndarray) -> np.ndarray:
+        """The conserved combination of the same functions that is nearest, if there is one.
+
+        Where another combination is nearly conserved, a share of it in this one is not seen in the
+        derivative. So what is left without the terms of the other has coefficients with errors.
+        """
+        kept = np.flatnonzero(c)
+        derivatives, totals = (x[_FIRST][:, kept] for x in (self.derivatives, self.totals))
+        _, sizes, basis = np.linalg.svd(derivatives, full_matrices=False)
+        roundoff = np.linalg.norm(totals @ np.abs(basis.T), axis=0) * self.eps
+        conserved = basis[sizes <= _ROUNDOFF * roundoff]
+        if not len(conserved):
+            return c
+        out = np.zeros_like(c)
+        out[kept] = conserved.T @ (conserved @ c[kept])
+        return out
+
 
 # The halves of the states, interleaved because they may be in some order.
 _FIRST, _SECOND, _ALL = slice(0, None, 2), slice(1, None, 2), slice(None)
@@ -448,7 +465,8 @@ def _simplified(samples: _Samples, rows: np.ndarray) -> list[np.ndarray]:
 
     def forms(c: np.ndarray) -> Iterator[np.ndarray]:
         for share in _SHARES:
-            short = np.where(np.abs(c) <= share * np.abs(c).max(), 0, c) / samples.size
+            short = np.where(np.abs(c) <= share * np.abs(c).max(), 0, c)
+            short = samples.refined(short) / samples.size
             short /= np.abs(short).max() * np.sign(short[np.flatnonzero(short)[0]])
             yield np.array([_number(x, share) for x in short])
             yield short
