@@ -81,7 +81,10 @@ def test_another_vector_field_is_told(path):
     network = dfc.DeepONet(jr.normal(jr.key(1), (9, 2)), 1.0, taylor=given, key=jr.key(0), **SMALL)
     dfc.save(path, dfc.learned.Repeated(network, 2))
     with pytest.raises(ValueError, match="Pass the field, and its `args`, for which the network"):
-        dfc.load(path, taylor=dfc.learned.Taylor(spring, 2, args=1.01))
+        dfc.load(path, taylor=dfc.learned.Taylor(spring, 2, args=1.0 + 1e-6))
+    of_others = dfc.learned.Taylor(lambda t, y, args: {"v": -y["q"], "q": y["v"]}, 2)
+    with pytest.raises(ValueError, match=r"cannot be computed.* Pass the field"):
+        dfc.load(path, taylor=of_others)
     dfc.load(path, taylor=dfc.learned.Taylor(oscillator, 2))
     layer, other = LAYER(RADIUS), LAYER(dfc.FirstIntegral(lambda t, y, args: y[0] ** 3))
     dfc.save(path, dfc.DeepONet(EAST[None], 1.0, layer=LAYER(RADIUS), key=jr.key(0), **SMALL))

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._manifold import Constraint, FirstIntegral, evaluate
-from .._tree import ravel, unravel
+from .._tree import eps_of, ravel, tree_shapes, unravel
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
 from ._networks.deeponet import DeepONet
@@ -132,9 +132,9 @@ def load(
         _check(model)
         network: Any = _unwrapped(model)
         if taylor is not None and (slope := header.get("slope")) is not None:
-            _check_same("vector field of `taylor`", _slope(network), slope, "field")
+            _check_same("vector field of `taylor`", _slope, network, slope, "field")
         if layer is not None and (gradients := header.get("gradients")) is not None:
-            _check_same("Jacobian of `layer`", _gradients(network), gradients, "manifold")
+            _check_same("Jacobian of `layer`", _gradients, network, gradients, "manifold")
         return model
 
     model = _read(path, build)
@@ -371,11 +371,20 @@ def _finite(x: np.ndarray) -> list[Any] | None:
     return x.tolist() if np.all(np.isfinite(x)) else None
 
 
-def _check_same(what: str, found: np.ndarray, saved: Any, remedy: str) -> None:
-    saved = np.asarray(saved, float)
-    same = found.shape == saved.shape
-    if not same or not np.max(np.abs(found - saved)) <= 1e-3 * np.max(np.abs(saved)):
+def _check_same(
+    what: str, of: Callable[[Any], np.ndarray], network: Any, saved: Any, remedy: str
+) -> None:
+    passed = f"Pass the {remedy}, and its `args`, for which the network was trained."
+    saved, y = np.asarray(saved, float), _state(network)
+    try:
+        found = of(network)
+    except Exception as error:  # whatever it is, the function of the user is the cause
         raise _NotGiven(
-            f"The {what} is {found} at a state where the saved network has {saved}. "
-            f"Pass the {remedy}, and its `args`, for which the network was trained."
+            f"The {what} cannot be computed at a state like {tree_shapes(y)}, as the saved network "
+            f"has: {type(error).__name__}, {str(error)[:300]}. {passed}"
+        ) from error
+    limit = eps_of(ravel(y)) ** 0.5 * np.max(np.abs(saved), initial=0)
+    if found.shape != saved.shape or not np.max(np.abs(found - saved), initial=0) <= limit:
+        raise _NotGiven(
+            f"The {what} is {found} at a state where the saved network has {saved}. {passed}"
         )

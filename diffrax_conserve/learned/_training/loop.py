@@ -70,7 +70,9 @@ class FitState(eqx.Module):
         # All but the records, whose length is that of the training.
         own, new = (carry._replace(losses=0, criteria=0) for carry in (self.carry, first.carry))
         if tree_shapes(own.weights) != tree_shapes(new.weights):
-            raise ValueError("`state` is that of a training of another network.")
+            raise ValueError(
+                "`state` is that of a training of another network, or by another recipe."
+            )
         if tree_shapes(own) != tree_shapes(new):
             raise ValueError("`state` is that of a training with another optimiser.")
         if self.done >= epochs or (self.finished and len(self.networks) > 1):
