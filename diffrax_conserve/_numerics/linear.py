@@ -26,7 +26,7 @@ def computed_after(x: Any, known: Any) -> Any:
     a number, as it might be NaN, and here it is none.
     """
     for leaf in jtu.tree_leaves(lax.stop_gradient(known)):
-        one = jnp.ravel(leaf)[0].real
+        one = jnp.sum(jnp.ravel(leaf)[:1].real)  # zero of an empty array
         zero = 0 * jnp.where(jnp.isfinite(one), one, 0)
         x = jtu.tree_map(lambda x, zero=zero: x + zero.astype(x.dtype), x)
     return x
