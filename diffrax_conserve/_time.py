@@ -7,9 +7,11 @@ from typing import Any, final
 
 import equinox as eqx
 import jax.numpy as jnp
+import jax.tree_util as jtu
 from jaxtyping import Array, Float, Real
 
 from ._custom_types import IntScalarLike, RealScalarLike
+from ._options import dtype_of
 
 
 @final
@@ -42,10 +44,19 @@ def traced_once(step: Callable[..., Any]) -> Callable[..., Any]:
         solver_state: Any,
         made_jump: Any,
     ) -> Any:
-        times = (jnp.asarray(1.0 * t) for t in (t0, t1))
+        times = (_in_precision_of(y0, t) for t in (t0, t1))
         return compiled(self, terms, *times, y0, args, solver_state, made_jump)
 
     return at_times
+
+
+def _in_precision_of(y: Any, t: RealScalarLike) -> RealScalarLike:
+    """A number of Python as an array with the precision of a state; an array as it is."""
+    if not isinstance(t, int | float):
+        return t
+    dtypes = [dtype_of(x) for x in jtu.tree_leaves(y)]
+    inexact = [x for x in dtypes if jnp.issubdtype(x, jnp.inexact)]
+    return jnp.asarray(t, jnp.finfo(jnp.result_type(*inexact or [float])).dtype)
 
 
 def nonzero_length(t0: RealScalarLike, t1: RealScalarLike) -> Float[Array, ""]:

@@ -231,7 +231,8 @@ def not_conserved(
     if not plain:
         return {}
     length = jtu.tree_leaves(exact)[0].shape[1]
-    sols = dataclasses.replace(sols, ts=sols.ts[:, :length], interpolation=None, stats={})
+    ts = jnp.asarray(sols.ts)[:, :length]
+    sols = dataclasses.replace(sols, ts=ts, interpolation=None, stats={})
     first, second = (
         _drifts(dataclasses.replace(sols, ys=jtu.tree_map(jnp.asarray, ys)), plain, args)
         for ys in (exact, rough)

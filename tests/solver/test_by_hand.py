@@ -105,3 +105,12 @@ def test_a_loop_at_times_of_python_compiles_once(make, terms, y):
         assert dfx.is_successful(result)
         counts.append(len(traces))
     assert counts[1] == counts[3]
+
+
+def test_numbers_of_python_have_the_precision_of_the_state():
+    y, args = jnp.array([1.0, 0.0], jnp.float32), jnp.float32(0.1)
+    state = SOLVER.init(TERM, 0.0, TICK, y, args)
+    for start, end in ((0, TICK), (TICK, 0.5), (np.float64(0.5), 1)):
+        y, _, _, state, result = SOLVER.step(TERM, start, end, y, args, state, made_jump=False)
+        assert dfx.is_successful(result)
+    assert y.dtype == jnp.float32
