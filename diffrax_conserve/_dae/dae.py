@@ -723,8 +723,8 @@ def _consistent(
         least = None if large is None else least_exact(vector.dtype)
         problem = problem_of(manifold, none, t, y, args, cancellation, atol=least)
         sizes, size = moving.astype(vector.dtype), jnp.abs(guess)
+        rows = (problem.with_dense_jacobian() if large is None else problem).linearise(vector)[1]
         if large is None:
-            rows = problem.with_dense_jacobian().linearise(vector)[1]
             assert isinstance(rows, DenseRows)
             size = jnp.maximum(size, implied_by_others(rows.matrix, jnp.abs(vector)))
         changes = share / eps_of(guess) * lax.stop_gradient(size)
@@ -733,7 +733,7 @@ def _consistent(
             still = ~moving if large is None else fixed
             solved = _nearest(dae, structure, problem, vector, sizes, still, MAX_NEWTON_STEPS)
             return unravel(with_zeros(solved.y, changes), y), solved.ok
-        units = structure.equilibrated_units(sizes, problem.linearise(vector)[1], algebraic)
+        units = structure.equilibrated_units(sizes, rows, algebraic)
         problem = dataclasses.replace(problem, factor=Diagonal(jnp.where(moving, units, 0)))
         found, info = SimplifiedNewton(max_steps=MAX_NEWTON_STEPS).solve(problem, vector)
         return unravel(with_zeros(found, changes), y), info.ok

@@ -61,9 +61,14 @@ def implied_by_others(
     largest = jnp.max(terms, axis=1, keepdims=True)
     second = jnp.max(jnp.where(is_largest, 0, terms), axis=1, keepdims=True)
     others = jnp.where(is_largest, second, largest)
-    divisor = jnp.where(slopes > 0, slopes, 1)
-    least = jnp.min(jnp.where((slopes > 0) & (others > 0), others / divisor, jnp.inf), axis=0)
+    least = _least_changes(slopes, jnp.where(others > 0, others, jnp.inf))
     return jnp.where(least < jnp.inf, least, 0)
+
+
+def _least_changes(slopes: Float[Array, "m n"], terms: Float[Array, "m #n"]) -> Float[Array, " n"]:
+    """For each unknown the least change that a term of one of its equations stands for."""
+    changes = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
+    return jnp.min(changes, axis=0, initial=jnp.inf)
 
 
 class _Factored(NamedTuple):
@@ -101,9 +106,7 @@ class _Factored(NamedTuple):
         """For each unknown the least change that the largest term of one of its equations stands
         for, if unknowns have these sizes."""
         slopes = jnp.abs(self.jacobian)
-        terms = jnp.max(slopes * size, axis=1, keepdims=True, initial=0)
-        least = jnp.where(slopes > 0, terms / jnp.where(slopes > 0, slopes, 1), jnp.inf)
-        return jnp.min(least, axis=0, initial=jnp.inf)
+        return _least_changes(slopes, jnp.max(slopes * size, axis=1, keepdims=True, initial=0))
 
 
 class _SparseFactored(NamedTuple):

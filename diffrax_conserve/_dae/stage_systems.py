@@ -69,13 +69,11 @@ class DenseSystems(NamedTuple):
         first = lu_factors(real * self.by_slope + self.by_y)
         second = lu_factors(computed_after(pair * self.by_slope + self.by_y, first[0]))
 
-        def solver(factors: tuple[Array, Array]) -> Solve:
-            def solve(b: Array, after: Array | None = None) -> Array:
-                return lu_solution(factors, b if after is None else computed_after(b, after))
+        def solve(factors: tuple[Array, Array], b: Array, after: Array | None = None) -> Array:
+            return lu_solution(factors, computed_after(b, after))
 
-            return solve
-
-        return solver(first), solver(second), lambda last, *results: computed_after(results, last)
+        freed = lambda last, *results: computed_after(results, last)  # noqa: E731
+        return ft.partial(solve, first), ft.partial(solve, second), freed
 
 
 class SparseSystems(NamedTuple):

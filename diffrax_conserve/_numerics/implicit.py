@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, Float
 
+from .._constants import MAX_ELIMINATION
 from .._tree import tree_tangents, unflatten
 from .closures import ClosureConverted
 from .iterate import Solved, simplified_newton
@@ -108,6 +109,10 @@ class MultiplierSystem(AbstractSystem):
             return self.candidate
         return jnp.where(ok, self.candidate, self.fallback)
 
+    def _ordered(self, x: Array, known: Array) -> Array:
+        """`x`, computed after other numbers if LAPACK solves for the multipliers."""
+        return computed_after(x, known) if self.problem.num_residuals > MAX_ELIMINATION else x
+
     def _directions_at(self, start: Array) -> AbstractRows:
         """The rows of `U`."""
         if self.directions is not None:
@@ -117,7 +122,7 @@ class MultiplierSystem(AbstractSystem):
     def linearisation_point(self, solved: Solved) -> tuple[Array, Array]:
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
-        start = computed_after(self._start(solved.ok), solved.y)
+        start = self._ordered(self._start(solved.ok), solved.y)
         row_norms, rows = self._directions_at(start).normalised()
         change = self.problem.factor.to_euclidean(jnp.where(solved.ok, solved.y, start) - start)
         return solved.ok, rows.least_squares_multiplier(change) / row_norms
@@ -141,7 +146,7 @@ class MultiplierSystem(AbstractSystem):
         and the tangent of the state is `ẏ + S Uᵀ λ̇`."""
         t_y, t_g = t_equations
         problem, start = self.problem, self._start(solved.ok)
-        y = computed_after(jnp.where(solved.ok, solved.y, start), unknowns[1])
+        y = self._ordered(jnp.where(solved.ok, solved.y, start), unknowns[1])
         row_norms, rows = problem.gradients(y).normalised()
         directions = self._directions_at(start).normalised()[1]
         change = rows.gram(directions).row_space_correction(
@@ -191,7 +196,7 @@ class SquareSystem(AbstractSystem):
     def solve_linearised(self, solved: Solved, unknowns: Any, t_equations: Any) -> Any:
         flat = _flat(unknowns)
         matrix = self.jacobian(lambda x: _flat(self.residual(unflatten(x, unknowns))))(flat)
-        matrix = computed_after(matrix, unknowns)
+        matrix = computed_after(matrix, unknowns)  # that of linear equations does not need them
         return unflatten(self.solve(matrix, -_flat(t_equations)), unknowns)
 
 
