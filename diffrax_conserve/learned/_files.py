@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._manifold import Constraint, FirstIntegral, evaluate
+from .._manifold import Constraint, FirstIntegral, at_full_precision, evaluate
 from .._tree import eps_of, ravel, tree_shapes, unravel
 from ..systems._registry import CLASSES
 from ._networks.cores import ACTIVATIONS, MLP, Concatenated, Gated, Product
@@ -346,7 +346,7 @@ def _slope(network: DeepONet) -> np.ndarray:
     taylor, y = network.taylor, _state(network)
     assert taylor is not None
     args = taylor.args if network.args_domain is None else network.args_domain.lower
-    return np.asarray(flatten(taylor.vector_field(0.0, y, args)), float)
+    return np.asarray(flatten(at_full_precision(taylor.vector_field, 0.0, y, args)), float)
 
 
 def _gradients(network: Network) -> np.ndarray:
