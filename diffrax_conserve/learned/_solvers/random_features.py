@@ -56,7 +56,9 @@ class RandomFeatureSolver(Hashable, dfx.AbstractSolver[None]):
     of an oscillator with 16 features is 1e-12. The error estimate, which fixed steps do not
     compute, is the remaining defect, propagated to the end of the step by the linearised equation,
     and what the Gauss rule does not resolve: the last two Legendre coefficients of the slopes,
-    which are large where the vector field jumps, has a kink or is steep.
+    which are large where the vector field jumps, has a kink or is steep. A jump between an end of a
+    step and the Gauss point next to it is not seen, with few features more often: pass the times of
+    jumps as `jump_ts` of `diffrax.ClipStepSizeController`.
 
     As a continuous Galerkin method the solver conserves the energy of every canonical Hamiltonian
     system, $y' = J \nabla H(y)$, to the accuracy of the Gauss rule, which soon reaches roundoff.
@@ -235,7 +237,7 @@ def _error(
 ) -> tuple[Float[Array, "wide n"], Float[Array, " n"]]:
     """The error of the solution over the step, in the wider basis: it solves
     `e' = h ∂f/∂u e + h f - u'` at the same points. The error of the Gauss rule is not seen at its
-    points, but it is as large as the last coefficients of what it integrates, or smaller."""
+    points, but is about as large as the last coefficients of what it integrates."""
     states = equations.states(coefficients)
     slopes = multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
     exact = equations.slopes(states)
