@@ -80,9 +80,8 @@ def test_the_estimate_is_not_below_the_true_error_of_a_step(field, y0, shortest,
 
 
 def test_the_estimate_sees_jumps_and_kinks_of_the_vector_field():
-    """A force that is switched on, and a spring that pushes from one side, beside another solver:
-    between the Gauss points nothing is seen of them but what they leave in the last coefficients of
-    the slopes. A jump outside of all points, near an end of a step, leaves nothing: not tested."""
+    """A force that is switched on, and a spring that pushes from one side, beside another solver.
+    With so many times some lie between an end of a step and the Gauss point next to it."""
 
     def switched(t, y, at):
         return jnp.stack([y[1], -y[0] - 0.1 * y[1] + jnp.where(t < at, 0.0, 1.0)])
@@ -90,18 +89,16 @@ def test_the_estimate_sees_jumps_and_kinks_of_the_vector_field():
     def one_sided(t, y, at):
         return jnp.stack([y[1], -y[0] - 5 * jnp.maximum(y[0] - at / 10, 0)])
 
-    y0, ats = jnp.array([1.0, 0.0]), jnp.linspace(1.3, 8.9, 12)
+    y0, ats = jnp.array([1.0, 0.0]), jnp.linspace(1.0, 9.0, 100)
     for field in (switched, one_sided):
 
         def last(at, solver, tol, field=field):
             options = dict(args=at, solver=solver, tol=tol, max_steps=4096)
             return solve(field, y0, 10.0, **options).ys[-1]
 
-        found = jax.vmap(lambda at: last(at, dfc.RandomFeatureSolver(), 1e-8))(ats)
+        found = jax.vmap(lambda at: last(at, EIGHT, 1e-8))(ats)
         exact = jax.vmap(lambda at: last(at, dfx.Dopri8(), 1e-11))(ats)
-        errors = np.max(np.abs(found - exact), axis=1)
-        assert np.max(errors) < 1e-5
-        assert np.median(errors) < 1e-7
+        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-7)
 
 
 def test_a_step_decays_where_the_solution_does():

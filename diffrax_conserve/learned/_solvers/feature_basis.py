@@ -34,7 +34,7 @@ class FeatureBasis(NamedTuple):
     slopes: Float[np.ndarray, "points wide"]  # q_k
     integrals: Float[np.ndarray, "points wide"]  # of q_k, from 0
     fit: Float[np.ndarray, "wide points"]  # values to the coefficients of the least-squares fit
-    last: Float[np.ndarray, "2 points"]  # values to the last two Legendre coefficients
+    unresolved: Float[np.ndarray, "4 points+2"]  # see `_unresolved`
     series: Float[np.ndarray, "degrees wide"]  # the integrals, as Chebyshev series in 2 s - 1
 
 
@@ -48,8 +48,6 @@ def feature_basis(count: int) -> FeatureBasis:
     root = np.sqrt(weights / 2)[:, None]
     # The members are orthonormal for the Gauss rule up to roundoff, which the inverse removes.
     fit = np.linalg.pinv(root * slopes) * root.T
-    degrees = np.arange(2 * count)[-2:]
-    last = np.sqrt(2 * degrees + 1) * legendre.legvander(points, degrees[-1])[:, degrees]
     nodes = 2 * count + 8
     values = legendre.legval(2 * chebyshev_points(nodes) - 1, integrated).T
     return FeatureBasis(
@@ -58,9 +56,22 @@ def feature_basis(count: int) -> FeatureBasis:
         slopes,
         legendre.legval(points, integrated).T,
         fit,
-        last.T * weights / 2,
+        _unresolved(points, weights),
         to_coefficients(nodes) @ values,
     )
+
+
+def _unresolved(
+    points: Float[np.ndarray, " points"], weights: Float[np.ndarray, " points"]
+) -> Float[np.ndarray, "4 points+2"]:
+    """From values at the points of a Gauss rule and then at both ends, about what the rule misses:
+    the last two Legendre coefficients, and how far the polynomial through the points is from the
+    values at the ends, times the distance of an end from the points."""
+    norms = np.sqrt(2 * np.arange(len(points)) + 1)
+    fit = (norms * legendre.legvander(points, len(points) - 1)).T * weights / 2
+    gap = (1 + points[0]) / 2
+    at_ends = norms * legendre.legvander([-1, 1], len(points) - 1) @ fit
+    return np.block([[fit[-2:], np.zeros((2, 2))], [-gap * at_ends, gap * np.eye(2)]])
 
 
 def _directions(wide: int) -> Float[np.ndarray, "degrees wide"]:

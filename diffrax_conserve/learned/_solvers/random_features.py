@@ -55,10 +55,9 @@ class RandomFeatureSolver(Hashable, dfx.AbstractSolver[None]):
     The solver is fast for high accuracy or stiff systems of few unknowns. The error over a period
     of an oscillator with 16 features is 1e-12. The error estimate, which fixed steps do not
     compute, is the remaining defect, propagated to the end of the step by the linearised equation,
-    and what the Gauss rule does not resolve: the last two Legendre coefficients of the slopes,
-    which are large where the vector field jumps, has a kink or is steep. A jump between an end of a
-    step and the Gauss point next to it is not seen, with few features more often: pass the times of
-    jumps as `jump_ts` of `diffrax.ClipStepSizeController`.
+    and what the Gauss rule does not resolve where the vector field jumps, has a kink or is steep:
+    the last two Legendre coefficients of the slopes, and how far their polynomial is from the
+    slopes at both ends of the step.
 
     As a continuous Galerkin method the solver conserves the energy of every canonical Hamiltonian
     system, $y' = J \nabla H(y)$, to the accuracy of the Gauss rule, which soon reaches roundoff.
@@ -175,6 +174,10 @@ class StepEquations(NamedTuple):
     def slopes(self, states: Float[Array, "points n"]) -> Float[Array, "points n"]:
         return jax.vmap(self.increment)(self._fractions(), states)
 
+    def slopes_at_ends(self, coefficients: Coefficients) -> Float[Array, "2 n"]:
+        ends = jnp.stack([self.y0, self.y0 + coefficients[0]])
+        return jax.vmap(self.increment)(jnp.arange(2, dtype=ends.dtype), ends)
+
     def jacobians(self, states: Float[Array, "points n"]) -> Float[Array, "points n n"]:
         return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._fractions(), states)
 
@@ -237,12 +240,13 @@ def _error(
 ) -> tuple[Float[Array, "wide n"], Float[Array, " n"]]:
     """The error of the solution over the step, in the wider basis: it solves
     `e' = h ∂f/∂u e + h f - u'` at the same points. The error of the Gauss rule is not seen at its
-    points, but is about as large as the last coefficients of what it integrates."""
+    points: `unresolved` is about as large."""
     states = equations.states(coefficients)
     slopes = multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
     exact = equations.slopes(states)
     right = multiply(equations.basis.fit, exact - slopes)
-    unresolved = jnp.sum(jnp.abs(multiply(equations.basis.last, exact)), axis=0)
+    everywhere = jnp.concatenate([exact, equations.slopes_at_ends(coefficients)])
+    unresolved = jnp.sum(jnp.abs(multiply(equations.basis.unresolved, everywhere)), axis=0)
     # Those of linear equations do not depend on the states.
     jacobians = computed_after(equations.jacobians(states), coefficients)
     return equations.solve_linear(jacobians, right), unresolved
