@@ -21,9 +21,10 @@ def computed_after(x: Any, known: Any) -> Any:
     """The arrays of a PyTree, computed after those of another.
 
     In a batch the calls of LAPACK in jaxlib 0.10 wait for their parts in the pool of threads in
-    which they run. If as many run at once as there are threads, they wait for ever: on two cores
-    two suffice. So in a program of ours no call is independent of another. XLA computes zero times
-    a number, as it might be NaN, and here it is none.
+    which they run, as those of jaxlib 0.7 to 0.9, 0.11 and 0.12 do not. If as many run at once as
+    there are threads, they wait for ever: on two cores two suffice. So in a program of ours no call
+    is independent of another. XLA computes zero times a number, as it might be NaN, and here it is
+    none.
     """
     for leaf in jtu.tree_leaves(lax.stop_gradient(known)):
         one = jnp.sum(jnp.ravel(leaf)[:1].real)  # zero of an empty array
