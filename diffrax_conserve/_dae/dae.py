@@ -634,6 +634,8 @@ def _parts(leaf: Any) -> int:
 
 def _flags(fixed: Any, y: Y) -> np.ndarray:
     def spread(flag: Any, part: Any) -> Any:
+        if isinstance(flag, jax.core.Tracer):
+            raise TypeError("`fixed` must be known while JAX traces: pass a NumPy array.")
         if np.asarray(flag).dtype != bool:
             raise ValueError(f"{flag!r} is not `True` or `False`.")
         return jtu.tree_map(lambda x: np.broadcast_to(flag, x.shape), part)
@@ -707,7 +709,9 @@ def _consistent(
     # this share of the guess, or of what other unknowns make of it, counts as zero, in float32 too,
     # where tiny currents have all digits.
     share = float(np.finfo(float).eps) ** 2
-    shared = structure.is_shared and (large is None or large.along is not None)
+    # If some are fixed, others may be in more constraints than they can meet.
+    shared = structure.is_shared or flags is not None
+    shared = shared and (large is None or large.along is not None)
     in_stages = flags is None and not (shared and large is not None)
     algebraic = structure.algebraic if structure.is_shared else structure.free
 

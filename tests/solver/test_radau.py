@@ -145,6 +145,26 @@ def test_what_is_fixed_stays():
     assert np.isclose(slope[0], -0.9 / root, rtol=1e-12)
 
 
+@pytest.mark.parametrize("fixed", [(0, 0, 0, 1), (0, 0, 1, 0), (1, 0, 0, 1)])
+def test_what_is_fixed_stays_and_what_is_differentiated_moves_least(fixed):
+    """Of `x' = -x`, `C x + D z = 1`, beside the conditions of optimality. In a chain of algebraic
+    unknowns whose last one is fixed, the others are in more equations than they can meet."""
+    dae = dfc.DAE(
+        lambda t, x, z, a: -x, algebraic=lambda t, x, z, a: a[0] @ x + jnp.tril(a[1]) @ z - 1
+    )
+    numbers = np.random.default_rng(0).uniform(1.0, 2.0, (12, 6, 2))
+    C, D, guess = numbers[:, :2] * [[[1.0], [0.0]]], np.tril(numbers[:, 2:4]), numbers[:, 4:]
+    still = np.array(fixed, bool)
+    flags = still[:2], still[2:]
+    found = jax.vmap(lambda C, D, y: dae.consistent(*y, args=(C, D), fixed=flags))(C, D, guess)
+    for y, start, C, D in zip(np.hstack(found), guess.reshape(-1, 4), C, D, strict=True):
+        np.testing.assert_array_equal(y[still], start[still])
+        rows = np.vstack([np.hstack([C, D]), np.eye(4)[still]])
+        matrix = np.block([[np.diag([1, 1, 0, 0]), rows.T], [rows, np.zeros((len(rows),) * 2)]])
+        right = np.concatenate([start[:2], [0, 0, 1, 1], start[still]])
+        np.testing.assert_allclose(y, np.linalg.solve(matrix, right)[:4], rtol=1e-12)
+
+
 def test_equations_have_the_names_of_their_functions():
     """Also where those of another `DAE` of the same shapes are differentiated more often."""
     y = {"u": jnp.array(0.0), "v": jnp.array(1.0)}, jnp.array(1.0)
@@ -276,6 +296,7 @@ test_mistakes_are_named = refused(
     (lambda: CONDENSER.wrap(CONDENSER.wrap(dfc.Radau())), TypeError, "itself"),
     (lambda: dfc.Radau(root_finder=3), TypeError, "VeryChord"),
     (lambda: CONDENSER.consistent(START, fixed="y"), ValueError, "`True` or `False`"),
+    (lambda: jax.jit(lambda x: CONDENSER.consistent(START, fixed=x))(True), TypeError, "`fixed`"),
     (
         lambda: jax.jit(lambda m: dfc.DAE(condenser, mass=m).term.vf(0.0, START, None))(MASS),
         TypeError,
