@@ -157,9 +157,9 @@ def test_what_is_fixed_stays_and_what_is_differentiated_moves_least(fixed):
     still = np.array(fixed, bool)
     flags = still[:2], still[2:]
     found = jax.vmap(lambda C, D, y: dae.consistent(*y, args=(C, D), fixed=flags))(C, D, guess)
-    for y, start, C, D in zip(np.hstack(found), guess.reshape(-1, 4), C, D, strict=True):
+    for y, start, c, d in zip(np.hstack(found), guess.reshape(-1, 4), C, D, strict=True):
         np.testing.assert_array_equal(y[still], start[still])
-        rows = np.vstack([np.hstack([C, D]), np.eye(4)[still]])
+        rows = np.vstack([np.hstack([c, d]), np.eye(4)[still]])
         matrix = np.block([[np.diag([1, 1, 0, 0]), rows.T], [rows, np.zeros((len(rows),) * 2)]])
         right = np.concatenate([start[:2], [0, 0, 1, 1], start[still]])
         np.testing.assert_allclose(y, np.linalg.solve(matrix, right)[:4], rtol=1e-12)
