@@ -94,8 +94,13 @@ class ManifoldInterpolation(dfx.AbstractLocalInterpolation):
         t = jnp.where(t0 < first, first, jnp.where(t0 > last, last, t0))
         u = self.inner.evaluate(t, left=left)
         theta = (t - self.t0) / nonzero_length(self.t0, self.t1)
-        moved = ravel(u) + theta.astype(self.step_correction.dtype) * self.step_correction
-        return unravel(self.projected(self.field_time(t), moved), u)
+        # The correction of an attempt that failed is NaN. In a batch it is evaluated and discarded,
+        # but in reverse mode zero times the derivative of NaN would be NaN.
+        known = jnp.all(jnp.isfinite(self.step_correction))
+        correction = jnp.where(known, self.step_correction, 0)
+        moved = ravel(u) + theta.astype(correction.dtype) * correction
+        y = self.projected(self.field_time(t), moved)
+        return unravel(jnp.where(known, y, jnp.nan), u)
 
     def projected(self, t: RealScalarLike, candidate: Float[Array, " n"]) -> Float[Array, " n"]:
         """The projection of the moved interpolant, or that itself where no projection succeeds."""

@@ -85,6 +85,8 @@ class MultiplierSystem(AbstractSystem):
     derivative uses the gradients at the candidate all the same, which differ from them by terms of
     the size of the correction.
 
+    Within bounds only some components are `corrected` in a derivative; see `Bounds.corrected`.
+
     The result of a failed projection is discarded. In reverse mode its cotangent is zero, but zero
     times a tangent that is not finite would be NaN. So where nothing was found we differentiate at
     the `fallback`, by default the candidate, where the functions should be finite.
@@ -93,6 +95,7 @@ class MultiplierSystem(AbstractSystem):
     problem: Problem
     candidate: Float[Array, " n"]
     directions: AbstractRows | None = None
+    corrected: Callable[[Array, AbstractRows], Array] | None = eqx.field(default=None, kw_only=True)
     fallback: Float[Array, " n"] | None = eqx.field(default=None, kw_only=True)
     iteration: Callable[..., Solved] = eqx.field(
         default=simplified_newton, static=True, kw_only=True
@@ -149,6 +152,8 @@ class MultiplierSystem(AbstractSystem):
         y = self._ordered(jnp.where(solved.ok, solved.y, start), unknowns[1])
         row_norms, rows = problem.gradients(y).normalised()
         directions = self._directions_at(start).normalised()[1]
+        if self.corrected is not None:
+            directions = directions.scale_columns(self.corrected(y, directions).astype(y.dtype))
         change = rows.gram(directions).row_space_correction(
             directions,
             t_g / row_norms,

@@ -90,5 +90,5 @@ class _Clipped(eqx.Module):
     def __call__(self, t: RealScalarLike, y: Y, args: Args) -> VF:
         y = jtu.tree_map(jnp.asarray, y)
         check_state(y, "`clipped`", jnp.inexact)
-        x = Bounds.of(self.lower, self.upper, y).clip(ravel(y), slope=0.0)
+        x = Bounds.of(self.lower, self.upper, y).clip(ravel(y))
         return self.vector_field(t, unravel(x, y), args)

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .._constants import MAX_DENSE_SYSTEM, TOLERANCE_IN_EPS
 from .._numerics.implicit import nan_tangent_unless, root
@@ -99,11 +99,13 @@ class _Conditions(eqx.Module):
     """The Lagrange conditions as functions of one vector: the change `u` from a `base`, with
     `y = base + S u`, and the multipliers times the norms of the gradients there. So no unknown has
     a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
-    vector without bounds, which `clip` maps to the state."""
+    vector without bounds, which `clip` maps to the state. In a derivative only what is strictly
+    within them is `corrected`; see `MultiplierSystem`."""
 
     given: _Given
     base: Float[Array, " n"]
     row_norms: Float[Array, " m"]
+    corrected: Bool[Array, " n"] | None = None
 
     def state(self, unknowns: Float[Array, " N"]) -> Float[Array, " n"]:
         # The base is only a place to start from. It moves with the candidate, and with nothing
@@ -118,6 +120,8 @@ class _Conditions(eqx.Module):
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
         gradient = problem.factor.scaled_gradient(vjp(multiplier / self.row_norms)[0])
+        if self.corrected is not None:
+            gradient = jnp.where(self.corrected, gradient, 0)
         return jnp.concatenate([problem.factor.to_euclidean(away) + change - gradient, g])
 
 
@@ -176,6 +180,10 @@ def _nearest(given: _Given, first: Array, max_steps: int) -> tuple[Array, Array]
     ok = ok & still.problem.is_on_manifold(still.clip(base))
     conditions, start, _ = _conditions(still, jnp.where(ok, base, first))
     conditions = dataclasses.replace(conditions, given=given)
+    if given.bounds is not None:
+        rows = still.problem.linearise(still.clip(conditions.base))[1]
+        corrected = still.bounds.corrected(conditions.base, rows)
+        conditions = dataclasses.replace(conditions, corrected=corrected)
     solved = root(
         conditions, lambda x: Solved(x, ok, count), start, ft.partial(solve_kkt, first.size)
     )

@@ -42,8 +42,9 @@ NEWTON_OPTIONS = r"""**Arguments:**
     or PyTrees that broadcast like `metric`. The result, always within the bounds, is
     $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints the nearest such point
     of the manifold. If there is none, the projection fails. A start that is outside is moved by the
-    first projection. In derivatives, components at a bound are constant. Of a complex component
-    both parts are bounded. Default: none.
+    first projection. In derivatives, components that were beyond a bound are constant, and those
+    exactly at one move with $\hat y$. Of a complex component both parts are bounded. Default:
+    none.
 
 **Raises:**
 

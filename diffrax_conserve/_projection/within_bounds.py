@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from .._constants import MAX_STEPS, SLOPE_BEYOND_BOUNDS
 from .._numerics.implicit import MultiplierSystem, implicit_solution
 from .._numerics.iterate import Solved, semismooth_newton, simplified_newton
 from .._numerics.metric import broadcast_option, positive_weights
 from .._numerics.problem import Problem
+from .._numerics.rows import AbstractRows
 from .._options import check_numbers
 from .._printing import is_traced
 from .base import AbstractProjection
@@ -45,9 +46,7 @@ class Bounds(eqx.Module):
         high = np.inf if upper is None else upper
         return cls(broadcast_option("lower", low, like), broadcast_option("upper", high, like))
 
-    def clip(
-        self, z: Float[Array, " n"], *, slope: float = SLOPE_BEYOND_BOUNDS
-    ) -> Float[Array, " n"]:
+    def clip(self, z: Float[Array, " n"], *, slope: float = 0.0) -> Float[Array, " n"]:
         """`z` within the bounds, with the derivative `slope` where it is beyond them. A component
         exactly at its bound has the derivative one, that from inside, unlike in `jnp.clip`."""
         lower, upper = self.lower, self.upper
@@ -57,9 +56,29 @@ class Bounds(eqx.Module):
         clipped = jnp.where(z < self.lower, lower, jnp.where(z > self.upper, upper, z))
         return jnp.where(self.lower <= self.upper, clipped, jnp.nan)
 
+    def corrected(self, z: Float[Array, " n"], rows: AbstractRows) -> Bool[Array, " n"]:
+        """The components to which the derivative of a projection adds a correction: those strictly
+        within the bounds, and all of a constraint that contains none of these.
 
-def _clipped(bounds: Bounds, fn: Callable[[Array], Array], z: Array) -> Array:
-    return fn(bounds.clip(z))
+        The derivative of a component that rests at its bound is that of the candidate. While it
+        rests, steps may be far too long for its stiffness, and multiply its derivative by large
+        numbers. So if it is zero, it must stay zero, without roundoff of a correction."""
+        within = (self.lower < z) & (z < self.upper)
+        contain = rows.scale_columns(within.astype(z.dtype)).largest_in_rows() > 0
+        others = rows.divide_rows(jnp.where(contain, jnp.inf, 1)).largest_in_columns() > 0
+        return within | others
+
+
+def _clipped(bounds: Bounds, fn: Callable[[Array], Array], slope: float, z: Array) -> Array:
+    return fn(bounds.clip(z, slope=slope))
+
+
+def _semismooth_newton(problem: Problem, *given: Any, max_steps: int) -> Solved:
+    """The iteration, for functions that have a derivative beyond the bounds."""
+    functions: Any = problem.functions
+    sloping = [eqx.Partial(_clipped, *fn.args[:2], SLOPE_BEYOND_BOUNDS) for fn in functions]
+    problem = dataclasses.replace(problem, functions=tuple(sloping))
+    return semismooth_newton(problem, *given, max_steps=max_steps)
 
 
 def along_gradients(
@@ -82,11 +101,16 @@ def along_gradients(
             MultiplierSystem(problem, candidate, iteration=iteration, max_steps=max_steps)
         )
     rows = problem.factor.scaled_rows(problem.linearise(candidate)[1])
-    functions = tuple(eqx.Partial(_clipped, bounds, fn) for fn in problem.functions)
+    functions = tuple(eqx.Partial(_clipped, bounds, fn, 0.0) for fn in problem.functions)
     within = dataclasses.replace(problem, functions=functions, clip=bounds.clip)
     return implicit_solution(
         MultiplierSystem(
-            within, candidate, rows, iteration=semismooth_newton, max_steps=2 * max_steps
+            within,
+            candidate,
+            rows,
+            corrected=bounds.corrected,
+            iteration=_semismooth_newton,
+            max_steps=2 * max_steps,
         )
     )
 

@@ -109,6 +109,63 @@ def test_derivatives_are_those_of_differences(kind):
     dct.assert_gradients(fn, x, rtol=1e-7)
 
 
+def enzyme(t, y, rates):
+    """A substrate is bound by an enzyme and used up; the product decays slowly."""
+    s, e, c, p, _ = y
+    binds, leaves, reacts, decays = rates * jnp.array([s * e, c, c, p])
+    slopes = [leaves - binds, leaves + reacts - binds, binds - leaves - reacts, reacts - decays]
+    return jnp.stack([*slopes, decays])
+
+
+@ONE_OF_BOTH
+def test_a_component_at_rest_at_its_bound_has_no_derivative_from_roundoff(kind):
+    """Once the substrate is zero the steps grow far beyond those that are stable for it, so that a
+    derivative of 1e-16 would grow to 1e15."""
+    amounts = {
+        "enzyme": dfc.FirstIntegral(lambda t, y, args: y[1] + y[2]),
+        "substrate": dfc.FirstIntegral(lambda t, y, args: jnp.sum(y) - y[1]),
+    }
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), amounts, projection=kind(lower=0.0, upper=9.0))
+
+    def decayed(log_rates):
+        sol = dfx.diffeqsolve(
+            dfx.ODETerm(enzyme), solver, 0.0, 5.0, None, jnp.array([1.0, 0.1, 0.0, 0.0, 0.0]),
+            jnp.exp(log_rates), stepsize_controller=dfx.PIDController(rtol=1e-4, atol=1e-5),
+            saveat=dfx.SaveAt(ts=jnp.linspace(0.0, 5.0, 6)), max_steps=256,
+        )  # fmt: skip
+        return jnp.sum(sol.ys[:, 4] ** 2), jnp.min(sol.ys[:, 0])
+
+    logs = jnp.log(jnp.array([[200.0, 1.0, 30.0, 0.1], [2000.0, 1.0, 100.0, 0.1]]))
+    run = jax.jit(jax.vmap(jax.value_and_grad(decayed, has_aux=True)))
+    (_, least), slopes = run(logs)
+    assert np.all(least == 0)
+    for i, change in enumerate(1e-3 * np.eye(4)):
+        high, low = (run(logs + x)[0][0] for x in (change, -change))
+        np.testing.assert_allclose(slopes[:, i], (high - low) / 2e-3, rtol=2e-2, atol=1e-4)
+
+
+def test_states_of_an_attempt_that_failed_spoil_no_derivative():
+    """In a batch they are evaluated in all lanes, and discarded."""
+    total = dfc.FirstIntegral(lambda t, y, args: jnp.array([y[1] + y[2], jnp.sum(y) - y[1]]))
+    projection = dfc.SimplifiedNewton(lower=0.0, upper=1.0)
+    solver = dfc.ManifoldProjection(dfx.Tsit5(), total, projection=projection)
+    term, y0 = dfx.ODETerm(enzyme), jnp.array([1.0, 0.1, 0.0, 0.0, 0.0])
+
+    def saved(rates, length):
+        state = solver.init(term, 0.0, length, y0, rates)
+        y1, _, info, *_ = solver.step(term, 0.0, length, y0, rates, state, False)
+        inside = solver.interpolation_cls(t0=0.0, t1=length, **info)
+        return inside.evaluate(length / 3), jnp.all(jnp.isfinite(y1))
+
+    rates = jnp.array([1e4, 1.0, 100.0, 0.1])
+    lengths = jnp.geomspace(1e-3, 1e-1, 15)
+    run = jax.vmap(lambda length: jax.vjp(lambda x: saved(x, length), rates, has_aux=True))
+    y, vjp, ok = jax.jit(run)(lengths)
+    assert 0 < np.sum(ok) < len(ok)
+    np.testing.assert_array_equal(np.all(np.isnan(y), axis=1), ~ok)
+    assert np.all(jax.vmap(lambda f: f(jnp.zeros(5))[0])(vjp) == 0)
+
+
 @ONE_OF_BOTH
 def test_what_cannot_be_fails(kind):
     total = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y))
