@@ -111,6 +111,8 @@ class _Conditions(eqx.Module):
         # The base is only a place to start from. It moves with the candidate, and with nothing
         # else, so that a component that is never moved has the derivative of the candidate.
         candidate, change = self.given.candidate, unknowns[: self.base.size]
+        if self.corrected is not None:  # the solution of a linear system has roundoff everywhere
+            change = jnp.where(self.corrected, change, 0)
         base = self.base + (candidate - lax.stop_gradient(candidate))
         return self.given.clip(base + self.given.problem.factor.to_state(change))
 

@@ -144,6 +144,19 @@ def test_a_component_at_rest_at_its_bound_has_no_derivative_from_roundoff(kind):
         np.testing.assert_allclose(slopes[:, i], (high - low) / 2e-3, rtol=2e-2, atol=1e-4)
 
 
+@BOTH
+def test_at_a_bound_a_derivative_has_no_roundoff(kind):
+    """It is that of the candidate, and beyond the bound it is zero."""
+    atoms, amounts = jnp.array([[0.0, 1.0, 1.0, 0.0], [1.0, 0.0, 1.0, 1.0]]), jnp.array([0.1, 1.0])
+    options = dict(args=atoms, value=amounts, projection=kind(lower=0.0))
+    derivative = jax.jit(jax.jacfwd(lambda y: dfc.project(BALANCES, y, **options)[0]))
+    at_it, beyond = (derivative(jnp.array([s, 0.06, 0.04, 0.96])) for s in (0.0, -1e-3))
+    np.testing.assert_array_equal(at_it[0], [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(beyond[0], 0.0)
+    for found in (at_it, beyond):
+        np.testing.assert_allclose(atoms @ found, 0, atol=2 * EPS)
+
+
 def test_states_of_an_attempt_that_failed_spoil_no_derivative():
     """In a batch they are evaluated in all lanes, and discarded."""
     total = dfc.FirstIntegral(lambda t, y, args: jnp.array([y[1] + y[2], jnp.sum(y) - y[1]]))
