@@ -35,7 +35,8 @@ def reachable_states(
     r"""States along the solutions through `y0s`, each at a random time up to `duration`.
 
     In a solve, each step of a flow map starts at the end of the last one. So pass such states as
-    `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to [`diffrax_conserve.fit`][].
+    `states` to [`diffrax_conserve.DeepONet`][], and as `sample` to [`diffrax_conserve.fit`][],
+    beside `y0s` themselves if solutions soon settle.
 
     **Arguments:**
 
