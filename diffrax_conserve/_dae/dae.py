@@ -716,8 +716,9 @@ def _consistent(
     algebraic = structure.algebraic if structure.is_shared else structure.free
 
     def with_zeros(found: Array, changes: Array) -> Array:
-        is_zero = jnp.abs(found) <= TOLERANCE_IN_EPS * eps_of(guess) * changes
-        return found - lax.stop_gradient(jnp.where(is_zero, found, 0))  # keeps its derivative
+        value = lax.stop_gradient(found)
+        is_zero = jnp.abs(value) <= TOLERANCE_IN_EPS * eps_of(guess) * changes
+        return found - jnp.where(is_zero, value, 0)  # keeps its derivative
 
     def nearer(y: Y, stage: tuple[Array, Array]) -> tuple[Y, Bool[Array, ""]]:
         asked, moving = stage

@@ -123,14 +123,16 @@ class AbstractRows(eqx.Module):
         if self.dtype == jnp.float64 and not self.is_large:
             like = jax.eval_shape(self.largest_in_rows)  # with the lanes, if they are the last axis
             return jnp.ones(like.shape, like.dtype), self
-        row_scales = self.largest_in_rows()
+        row_scales = lax.stop_gradient(self.largest_in_rows())
         row_scales = jnp.where(row_scales > 0, row_scales, 1)
         return row_scales, self.divide_rows(row_scales)
 
     def normalised(self: Rows) -> tuple[Float[Array, " m"], Rows]:
         """The norms of the rows, and the rows divided by them, so that the pivots of their Gram
-        matrix are squares of sines. Sparse rows are only equilibrated, because the pivots of a
-        sparse matrix are not compared with `pivot_tolerance`."""
+        matrix are squares of sines. As no correction depends on the norms, they have no derivative:
+        that of a row of zeros, of what is not asked for, would be NaN. Sparse rows are only
+        equilibrated, because the pivots of a sparse matrix are not compared with
+        `pivot_tolerance`."""
         return self.equilibrated()
 
     def derivative_pivot_tolerance(self) -> float:
@@ -223,7 +225,7 @@ class DenseRows(AbstractRows):
 
     def normalised(self) -> tuple[Float[Array, " m"], "DenseRows"]:
         row_scales, rows = self.equilibrated()
-        norms = jnp.linalg.norm(rows.matrix, axis=1)
+        norms = lax.stop_gradient(jnp.linalg.norm(rows.matrix, axis=1))
         norms = jnp.where(norms > 0, norms, 1)
         return row_scales * norms, rows.divide_rows(norms)
 

@@ -386,3 +386,20 @@ def test_a_solve_that_meets_a_fold_ends_there():
     found = dfx.diffeqsolve(dae.term, dae.wrap(dfc.Radau()), 0.0, 2.0, 0.01, y0, **options)
     assert found.result == dfx.RESULTS.nonlinear_divergence
     assert found.stats["num_steps"] < 250
+
+
+def test_second_derivatives_of_a_consistent_state():
+    """The force in a pendulum of mass `m` is `m (w² + g cos θ)`, by its velocity `w`. While one
+    stage is sought, the constraints of others are rows of zeros."""
+    down = jnp.array([0.0, -9.81])
+
+    def equations(t, y, slopes, mass):
+        (q, v, force), (dq, dv, _) = y, slopes
+        return dq - v, mass * (dv - down) + force * q, jnp.sum(q**2) - 1
+
+    dae, q = dfc.DAE(residual=equations), jnp.array([0.6, -0.8])
+
+    def force(w):
+        return dae.consistent((q, w * jnp.array([0.8, 0.6]), jnp.array(2.0)), args=1.3)[2]
+
+    assert np.isclose(jax.jit(jax.jacrev(jax.jacfwd(force)))(0.4), 2 * 1.3, rtol=1e-12)
