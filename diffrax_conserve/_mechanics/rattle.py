@@ -266,12 +266,17 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
         def halfway(displacement: Array) -> Array:
             return kicked + per_step * _impulse(problem, displacement, at.jacobian)
 
+        def largest(displacement: Array) -> Array:
+            """By how much the multipliers move the positions, if their terms do not cancel."""
+            absolute = jax.tree.map(jnp.abs, at.jacobian)
+            return jnp.abs(h * drift(per_step * _impulse(problem, jnp.abs(displacement), absolute)))
+
         def position(displacement: Array) -> Array:
             return q + h * drift(halfway(displacement))
 
         displacement, found, _, _ = root(
             lambda x: problem.residual(position(x)),
-            ft.partial(_shake, problem, position, at, q, self.max_steps),
+            ft.partial(_shake, problem, position, largest, at, q, self.max_steps),
             state.multiplier * (h * h / 2),
             solve_dense,
         )
@@ -352,14 +357,21 @@ def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n
 
 
 def _shake(
-    problem: Problem, position: Any, at: _Linear, q: Array, max_steps: int, guess: Array
+    problem: Problem,
+    position: Any,
+    largest: Any,
+    at: _Linear,
+    q: Array,
+    max_steps: int,
+    guess: Array,
 ) -> Solved:
     """Simplified Newton's method for the multipliers of SHAKE, with the matrix at the start of the
     step of the solver: an iteration evaluates the constraint and nothing else."""
     # The residuals are compared with their scales at the start of the step, for coordinates as
-    # large as at either end.
+    # large as at either end, and as what moves them: that of a node that is pinned at zero stays
+    # zero up to the roundoff of multipliers that cancel.
     sizes = jnp.maximum(jnp.abs(q), jnp.abs(position(jnp.zeros_like(guess))))
-    scale, solve = problem.scale(at.jacobian, sizes), lax.stop_gradient(at.solve)
+    solve = lax.stop_gradient(at.solve)
     _, moves = jax.linearize(position, guess)
 
     def change(g: Array) -> Array:
@@ -373,6 +385,7 @@ def _shake(
 
     def advance(x: Array, tests_left: Array) -> tuple[Array, Array]:
         g = _barrier(problem.residual(_barrier(position(x))))
+        scale = problem.scale(at.jacobian, sizes + largest(x))
         status, _ = problem.status(g, scale)
         tests_left = remaining_after_test(status, tests_left)
         return where_active(tests_left, x - change(g), x), tests_left

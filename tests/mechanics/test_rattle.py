@@ -307,3 +307,26 @@ test_mistakes_are_named = refused(
     (of(velocities=1), "alike"),
     (of(NOISY), ValueError, "ODETerm"),
 )
+
+
+def test_a_node_may_be_pinned_at_zero():
+    """Its coordinates stay zero up to roundoff of the multipliers, which cancel there. The same
+    pendulum elsewhere is another reference than its own zero."""
+
+    def end(shift):
+        constraint = dfc.Constraint(
+            lambda t, q, args: {"rod": jnp.sum((q[1] - q[0]) ** 2) - 1, "pin": q[0] - args}
+        )
+        q0 = jnp.array([[0.0, 0.0, 0.0], [0.6, 0.0, -0.8]]) + shift
+        v0 = jnp.zeros((2, 3)).at[1].set(jnp.array([0.0, 0.3, 0.0]))
+        terms = (
+            dfx.ODETerm(lambda t, v, args: v),
+            dfx.ODETerm(lambda t, q, args: jnp.zeros_like(q).at[:, 2].set(-9.81)),
+        )
+        solver = dfc.RATTLE(constraint, masses=1.0)
+        sol = dfx.diffeqsolve(terms, solver, 0, 1, 1e-3, (q0, v0), shift, max_steps=1001)
+        return sol.ys[0][-1] - shift
+
+    here, there = jax.jit(jax.vmap(end))(jnp.array([[0.0, 0.0, 0.0], [1.0, 2.0, 3.0]]))
+    np.testing.assert_allclose(here[0], 0, atol=1e-18)
+    np.testing.assert_allclose(here, there, atol=1e-12)
