@@ -268,8 +268,8 @@ class RATTLE(Hashable, dfx.AbstractSolver[Any]):
 
         def largest(displacement: Array) -> Array:
             """By how much the multipliers move the positions, if their terms do not cancel."""
-            absolute = jax.tree.map(jnp.abs, at.jacobian)
-            return jnp.abs(h * drift(per_step * _impulse(problem, jnp.abs(displacement), absolute)))
+            terms = _largest_impulse(problem, displacement, at.jacobian)
+            return jnp.abs(h * drift(per_step * terms))
 
         def position(displacement: Array) -> Array:
             return q + h * drift(halfway(displacement))
@@ -356,6 +356,12 @@ def _impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n
     return problem.factor.scaled_gradient(problem.factor.scaled_gradient(rows.rmatvec(multiplier)))
 
 
+def _largest_impulse(problem: Problem, multiplier: Array, rows: Any) -> Float[Array, " n"]:
+    """`M⁻¹ |G|ᵀ |λ|`: in a taut chain the multipliers of neighbours are large and cancel, and the
+    roundoff of an impulse is that of its terms, and not of their sum."""
+    return _impulse(problem, jnp.abs(multiplier), jax.tree.map(jnp.abs, rows))
+
+
 def _shake(
     problem: Problem,
     position: Any,
@@ -411,9 +417,6 @@ def _on_tangent(
     to_correct = rate + at.jacobian.matvec(drift(p))
     x = lax.custom_linear_solve(product, -to_correct, iterated, iterated, symmetric=True)
     v = p + _impulse(problem, x, at.jacobian)
-    # In a taut chain the multipliers of neighbours are large and cancel. So the roundoff of the
-    # velocities is that of the terms, and not of their sum.
-    terms = _impulse(problem, jnp.abs(x), jax.tree.map(jnp.abs, at.jacobian))
-    sizes = jnp.abs(drift(p)) + jnp.abs(drift(terms))
+    sizes = jnp.abs(drift(p)) + jnp.abs(drift(_largest_impulse(problem, x, at.jacobian)))
     limit = problem.tolerance(jnp.abs(rate) + at.jacobian.absolute_matvec(sizes))
     return v, jnp.all(jnp.abs(rate + at.jacobian.matvec(drift(v))) <= limit)

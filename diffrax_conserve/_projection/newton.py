@@ -100,7 +100,7 @@ class _Conditions(eqx.Module):
     `y = base + S u`, and the multipliers times the norms of the gradients there. So no unknown has
     a unit, and no digits are lost if the candidate is far away. Within bounds `base + S u` is a
     vector without bounds, which `clip` maps to the state. In a derivative only what is strictly
-    within them is `corrected`; see `MultiplierSystem`."""
+    within them is `corrected`; see `Bounds`."""
 
     given: _Given
     base: Float[Array, " n"]

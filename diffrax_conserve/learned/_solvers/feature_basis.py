@@ -26,11 +26,11 @@ class FeatureBasis(NamedTuple):
     """Tables of an orthonormal basis `q_k` of slopes on [0, 1], the constant first.
 
     The first `size` members span the solution, all of them its error. In `slopes` and `integrals`,
-    columns belong to members and rows to the Gauss points `fractions`.
+    columns belong to members and rows to the Gauss points, the first `fractions`.
     """
 
     size: int
-    fractions: Float[np.ndarray, " points"]
+    fractions: Float[np.ndarray, " points+2"]  # of the step: the Gauss points, then both ends
     slopes: Float[np.ndarray, "points wide"]  # q_k
     integrals: Float[np.ndarray, "points wide"]  # of q_k, from 0
     fit: Float[np.ndarray, "wide points"]  # values to the coefficients of the least-squares fit
@@ -52,7 +52,7 @@ def feature_basis(count: int) -> FeatureBasis:
     values = legendre.legval(2 * chebyshev_points(nodes) - 1, integrated).T
     return FeatureBasis(
         count,
-        (points + 1) / 2,
+        np.append((points + 1) / 2, [0.0, 1.0]),
         slopes,
         legendre.legval(points, integrated).T,
         fit,

@@ -172,14 +172,11 @@ class StepEquations(NamedTuple):
         return self.y0 + multiply(self.basis.integrals[:, : len(coefficients)], coefficients)
 
     def slopes(self, states: Float[Array, "points n"]) -> Float[Array, "points n"]:
-        return jax.vmap(self.increment)(self._fractions(), states)
-
-    def slopes_at_ends(self, coefficients: Coefficients) -> Float[Array, "2 n"]:
-        ends = jnp.stack([self.y0, self.y0 + coefficients[0]])
-        return jax.vmap(self.increment)(jnp.arange(2, dtype=ends.dtype), ends)
+        """Of two more states too, which are those at both ends of the step."""
+        return jax.vmap(self.increment)(self._fractions(len(states)), states)
 
     def jacobians(self, states: Float[Array, "points n"]) -> Float[Array, "points n n"]:
-        return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._fractions(), states)
+        return jax.vmap(jax.jacfwd(self.increment, argnums=1))(self._fractions(len(states)), states)
 
     def residual(self, coefficients: Coefficients) -> Coefficients:
         fit = self.basis.fit[: len(coefficients)]
@@ -199,8 +196,8 @@ class StepEquations(NamedTuple):
         matrix = jnp.eye(count * n, dtype=right.dtype) - coupling
         return jnp.linalg.solve(matrix, right.ravel()).reshape(count, n)
 
-    def _fractions(self) -> Float[Array, " points"]:
-        return jnp.asarray(self.basis.fractions, self.y0.dtype)
+    def _fractions(self, count: int) -> Float[Array, " points"]:
+        return jnp.asarray(self.basis.fractions[:count], self.y0.dtype)
 
 
 def solve(equations: StepEquations) -> tuple[Coefficients, Bool[Array, ""]]:
@@ -243,9 +240,9 @@ def _error(
     points: `unresolved` is about as large."""
     states = equations.states(coefficients)
     slopes = multiply(equations.basis.slopes[:, : len(coefficients)], coefficients)
-    exact = equations.slopes(states)
-    right = multiply(equations.basis.fit, exact - slopes)
-    everywhere = jnp.concatenate([exact, equations.slopes_at_ends(coefficients)])
+    ends = jnp.stack([equations.y0, equations.y0 + coefficients[0]])
+    everywhere = equations.slopes(jnp.concatenate([states, ends]))
+    right = multiply(equations.basis.fit, everywhere[:-2] - slopes)
     unresolved = jnp.sum(jnp.abs(multiply(equations.basis.unresolved, everywhere)), axis=0)
     # Those of linear equations do not depend on the states.
     jacobians = computed_after(equations.jacobians(states), coefficients)
