@@ -126,9 +126,31 @@ class MultiplierSystem(AbstractSystem):
         """The multipliers `λ`, by `U S⁻¹ (y - ŷ) = U Uᵀ λ`, after the flag that tells `equations`
         where to differentiate: whether a state was found."""
         start = self._ordered(self._start(solved.ok), solved.y)
-        row_norms, rows = self._directions_at(start).normalised()
-        change = self.problem.factor.to_euclidean(jnp.where(solved.ok, solved.y, start) - start)
-        return solved.ok, rows.least_squares_multiplier(change) / row_norms
+        y = jnp.where(solved.ok, solved.y, start)
+        change = self.problem.factor.to_euclidean(y - start)
+        if self.corrected is None:
+            norms, rows = self._directions_at(start).normalised()
+            return solved.ok, rows.least_squares_multiplier(change) / norms
+        # Of the other components the derivative is not that of `ŷ + S Uᵀ λ`.
+        _, rows, norms, directions, _ = self._linearised(y, start)
+        gram, tolerance = rows.gram(directions), rows.derivative_pivot_tolerance()
+        multiplier = gram.solve(rows.matvec(change), pivot_tolerance=tolerance)
+        return solved.ok, multiplier / norms
+
+    def _linearised(
+        self, y: Array, start: Array
+    ) -> tuple[Array, AbstractRows, Array, AbstractRows, Array | bool]:
+        """The norms of the rows `G(y) S`, and the rows divided by them; likewise the directions;
+        and which components of the state are corrected. Others are zero in both."""
+        factor, corrected = self.problem.factor, True
+        jacobian, directions = self.problem.linearise(y)[1], self._directions_at(start)
+        if self.corrected is not None:
+            corrected = self.corrected(y, jacobian)
+            jacobian = jacobian.scale_columns(corrected.astype(y.dtype))
+            if not factor.is_dense:
+                directions = directions.scale_columns(corrected.astype(y.dtype))
+        rows = factor.scaled_rows(jacobian)
+        return *rows.normalised(), *directions.normalised(), corrected
 
     def equations(self, unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
         ok, multiplier = unknowns
@@ -150,16 +172,13 @@ class MultiplierSystem(AbstractSystem):
         t_y, t_g = t_equations
         problem, start = self.problem, self._start(solved.ok)
         y = self._ordered(jnp.where(solved.ok, solved.y, start), unknowns[1])
-        row_norms, rows = problem.gradients(y).normalised()
-        directions = self._directions_at(start).normalised()[1]
-        if self.corrected is not None:
-            directions = directions.scale_columns(self.corrected(y, directions).astype(y.dtype))
+        row_norms, rows, _, directions, corrected = self._linearised(y, start)
         change = rows.gram(directions).row_space_correction(
             directions,
             t_g / row_norms,
             pivot_tolerance=rows.derivative_pivot_tolerance(),
         )
-        return t_y - problem.factor.to_state(change)
+        return t_y - jnp.where(corrected, problem.factor.to_state(change), 0)
 
 
 @jax.custom_jvp

@@ -110,11 +110,11 @@ class _Conditions(eqx.Module):
     def state(self, unknowns: Float[Array, " N"]) -> Float[Array, " n"]:
         # The base is only a place to start from. It moves with the candidate, and with nothing
         # else, so that a component that is never moved has the derivative of the candidate.
-        candidate, change = self.given.candidate, unknowns[: self.base.size]
+        candidate = self.given.candidate
+        change = self.given.problem.factor.to_state(unknowns[: self.base.size])
         if self.corrected is not None:  # the solution of a linear system has roundoff everywhere
             change = jnp.where(self.corrected, change, 0)
-        base = self.base + (candidate - lax.stop_gradient(candidate))
-        return self.given.clip(base + self.given.problem.factor.to_state(change))
+        return self.given.clip(self.base + (candidate - lax.stop_gradient(candidate)) + change)
 
     def __call__(self, unknowns: Float[Array, " N"]) -> Float[Array, " N"]:
         problem, away = self.given.problem, self.base - lax.stop_gradient(self.given.candidate)
@@ -122,8 +122,6 @@ class _Conditions(eqx.Module):
         # `G(y)ᵀ λ` by one reverse pass, instead of one for each row of `G`.
         g, vjp = jax.vjp(problem.residual, self.state(unknowns))
         gradient = problem.factor.scaled_gradient(vjp(multiplier / self.row_norms)[0])
-        if self.corrected is not None:
-            gradient = jnp.where(self.corrected, gradient, 0)
         return jnp.concatenate([problem.factor.to_euclidean(away) + change - gradient, g])
 
 

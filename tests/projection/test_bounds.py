@@ -1,5 +1,7 @@
 """The nearest point of a manifold within bounds."""
 
+import itertools as it
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -107,6 +109,36 @@ def test_derivatives_are_those_of_differences(kind):
     y = jax.jit(fn)(x)
     assert (y[0], y[3]) == (0, 0.25)
     dct.assert_gradients(fn, x, rtol=1e-7)
+
+
+METRICS = {
+    "none": None,
+    "weights": jnp.array([1.0, 4.0, 0.5, 2.0]),
+    "matrix": jnp.array(
+        [[2, 0.6, 0.3, 0.3], [0.6, 1, 0, 0.2], [0.3, 0, 1, 0.3], [0.3, 0.2, 0.3, 2]]
+    ),
+}
+
+
+@some_of(
+    "kind, metric",
+    it.product(KINDS.values(), METRICS.values()),
+    ids=map("-".join, it.product(KINDS, METRICS)),
+    period=3,
+)
+def test_first_and_second_derivatives_are_those_of_differences(kind, metric):
+    """A component beyond its bound depends on the multipliers, and its derivative does not."""
+    projection = kind(lower=0.0, metric=metric)
+    manifold = dfc.FirstIntegral(lambda t, y, args: jnp.stack([jnp.sum(y), jnp.sum(y**2)]))
+
+    def both(candidate, value):
+        fn = lambda *x: dfc.project(manifold, x[0], value=x[1], projection=projection)[0]  # noqa: E731
+        y, vjp = jax.vjp(fn, candidate, value)
+        return y, vjp(jnp.array([1.0, 2.0, -1.0, 0.5]))
+
+    given = jnp.array([0.51, 0.249, 0.252, -0.01]), jnp.array([1.0, 0.375])
+    assert jax.jit(both)(*given)[0][3] == 0
+    dct.assert_gradients(both, *given, rtol=1e-7)
 
 
 def enzyme(t, y, rates):
