@@ -1,5 +1,6 @@
 """Laws of small programs: the same function, the same derivatives, and no operation twice."""
 
+import diffrax as dfx
 import jax
 import jax.lax as lax
 import jax.numpy as jnp
@@ -11,6 +12,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve._constants import MAX_SCALAR_OPERATIONS
 from diffrax_conserve._dae.dae import _Constraints, _structure
 from diffrax_conserve._fast.arrays import folded
+from diffrax_conserve._fast.jaxprs import jaxprs_inside
 from diffrax_conserve._fast.scalars import scalarised, small, written_out
 
 from .test_scalars import equations_in, names_of_arrays
@@ -204,3 +206,23 @@ def test_whether_equations_contain_slopes_is_told_by_their_program():
     assert _structure(without, 0.0, y, None).always_fits
     perhaps = dfc.DAE(residual=top).at(y, args=some)
     assert not _structure(perhaps, 0.0, y, some).always_fits
+
+
+def num_calls(name, closed):
+    """How often a function under `jax.jit` stands in a program, loops and branches included."""
+    own = sum(eqn.params.get("name") == name for eqn in closed.jaxpr.eqns)
+    inside = (x for eqn in closed.jaxpr.eqns for x in jaxprs_inside(eqn))
+    return own + sum(num_calls(name, x) for x in inside)
+
+
+def test_many_constraints_are_linearised_once_where_a_state_is_the_same():
+    """At the candidate, at the result, and in the test of the start: each was most of the time to
+    compile where the functions are large."""
+    squares = dfc.FirstIntegral(lambda t, y, args: y[:20] ** 2 + jnp.roll(y, 1)[:20])
+    solver, term = dfc.ManifoldProjection(dfx.Euler(), squares), dfx.ODETerm(lambda t, y, args: -y)
+
+    def step(y):
+        state = solver.init(term, 0.0, 1.0, y, None)
+        return solver.step(term, 0.0, 0.1, y, None, state, False)[0]
+
+    assert num_calls("linearise", jax.make_jaxpr(step)(jnp.linspace(1.0, 2.0, 30))) == 3

@@ -271,12 +271,12 @@ def _with_frozen_jacobian(
 
     These are compared with the scales at that state, because those at each state would need a
     Jacobian. So after these steps the result is tested once more, by its own scales. If it is not
-    on the manifold, the next steps have the directions, the matrix and the scales there.
+    on the manifold, the next steps have the directions, the matrix and the scales there. The values
+    and the Jacobian at the result are returned as `aux`.
     """
 
     def linearised_once(now: _Rounds) -> _Rounds:
-        y = now.y
-        jacobian = problem.linearise(y)[1]
+        y, (_, jacobian) = now.y, now.linearised
         scale = problem.scale(jacobian, y)
         row_scales, rows = problem.factor.scaled_rows(jacobian).equilibrated()
         solve = rows.gram(rows).factorise()
@@ -295,22 +295,25 @@ def _with_frozen_jacobian(
 
         steps = jnp.minimum(FROZEN_STEPS, max_steps - now.num_iterations)
         moved, _, count, _ = iterate(advance, y, max_steps=steps)
-        ok, count = problem.is_on_manifold(moved), now.num_iterations + count
+        linearised, count = problem.linearise(moved), now.num_iterations + count
+        ok = problem.holds(moved, *linearised)
         hopeful = (count > now.num_iterations) & (count < max_steps) & jnp.all(jnp.isfinite(moved))
-        new = _Rounds(moved, ok, count, ~ok & hopeful)
+        new = _Rounds(moved, linearised, ok, count, ~ok & hopeful)
         return jtu.tree_map(ft.partial(jnp.where, now.goes_on), new, now)
 
-    candidate = lax.optimization_barrier(candidate)  # as for few constraints
-    begin = _Rounds(candidate, jnp.asarray(False), jnp.asarray(0), jnp.asarray(True))
+    no, yes, none = jnp.asarray(False), jnp.asarray(True), jnp.asarray(0)
+    begin = _Rounds(candidate, problem.linearise(candidate), no, none, yes)
     end = lax.while_loop(lambda now: any_lane(now.goes_on), linearised_once, begin)
-    return Solved(end.y, end.ok, end.num_iterations)
+    return Solved(end.y, end.ok, end.num_iterations, end.linearised)
 
 
 class _Rounds(NamedTuple):
-    """The state after some rounds of steps, each with one Jacobian, whether it is on the manifold,
-    the number of iterations, and whether there is another round."""
+    """The state after some rounds of steps, each with one Jacobian, the values and the Jacobian
+    there, whether it is on the manifold, the number of iterations, and whether there is another
+    round."""
 
     y: Float[Array, " n"]
+    linearised: tuple[Float[Array, " m"], AbstractRows]
     ok: Bool[Array, ""]
     num_iterations: Int[Array, ""]
     goes_on: Bool[Array, ""]

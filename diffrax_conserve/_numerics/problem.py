@@ -130,14 +130,7 @@ class Problem(eqx.Module):
         """
         if self.pattern is not None and not self.factor.is_dense:
             return SparseRows.linearised(self.pattern, self.functions, y)
-        residuals, rows = [], []
-        for part in self.functions:
-            value, vjp = jax.vjp(part, y)
-            residuals.append(value)
-            if value.size == 1:
-                rows.append(vjp(jnp.ones_like(value))[0][None])
-            else:
-                rows.append(jax.vmap(vjp)(np.eye(value.size, dtype=value.dtype))[0])
+        residuals, rows = zip(*(linearised(part, y) for part in self.functions), strict=True)
         return jnp.concatenate(residuals), DenseRows(jnp.concatenate(rows))
 
     def gradients(self, y: Float[Array, " n"]) -> AbstractRows:
@@ -179,7 +172,12 @@ class Problem(eqx.Module):
 
     def is_on_manifold(self, y: Float[Array, " n"]) -> Bool[Array, ""]:
         """Whether `y` is on the manifold."""
-        g, jacobian = self.linearise(y)
+        return self.holds(y, *self.linearise(y))
+
+    def holds(
+        self, y: Float[Array, " n"], g: Float[Array, " m"], jacobian: AbstractRows
+    ) -> Bool[Array, ""]:
+        """Whether a state with these values and this Jacobian is on the manifold."""
         return self.status(g, self.scale(jacobian, y))[0] >= WITHIN_TOLERANCE
 
     def per_residual(self, of_entries: Sequence[Any]) -> np.ndarray:
@@ -194,6 +192,7 @@ class Problem(eqx.Module):
         *,
         ok: Bool[Array, ""] | None = None,
         converged: Bool[Array, ""] | bool = False,
+        linearised: tuple[Float[Array, " m"], AbstractRows] | None = None,
     ) -> ProjectionInfo:
         """The report on a projection from `candidate` to `y`, as `solve` must return it.
 
@@ -203,10 +202,11 @@ class Problem(eqx.Module):
         - `ok`: whether the projection succeeded. By default: whether every residual is within
             its tolerance at `y`, or `converged`.
         - `converged`: whether the iteration tells that it succeeded.
+        - `linearised`: the values and the Jacobian at `y`, if they are known.
         """
         # A report has no derivative.
         problem, candidate, y = tree_stop_gradient((self, candidate, y))
-        after, jacobian = problem.linearise(y)
+        after, jacobian = problem.linearise(y) if linearised is None else linearised
         scale = problem.scale(jacobian, y)
         sizes = [jnp.abs(relative_to_scale(g, scale)) for g in (problem.residual(candidate), after)]
         # On a CPU a maximum can lose a NaN, so NaN counts as infinite.
@@ -233,6 +233,19 @@ class Problem(eqx.Module):
             worst=entry[jnp.argmax(jnp.minimum(*sizes))],
             names=self.names,
         )
+
+
+def linearised(fn: Residual, y: Float[Array, " n"]) -> tuple[Array, Float[Array, "m n"]]:
+    """The values of a function and its Jacobian. With many values, as those of all constraints of a
+    mechanism, in forward mode: reverse mode compiled twice as long and took as long."""
+    size = jax.eval_shape(fn, y).size
+    if 2 * size > y.size > 1:
+        pushed = jax.vmap(lambda v: jax.jvp(fn, (y,), (v,)), out_axes=(None, 1))
+        return pushed(np.eye(y.size, dtype=y.dtype))
+    value, vjp = jax.vjp(fn, y)
+    if size == 1:
+        return value, vjp(jnp.ones_like(value))[0][None]
+    return value, jax.vmap(vjp)(np.eye(size, dtype=value.dtype))[0]
 
 
 def step_norm(

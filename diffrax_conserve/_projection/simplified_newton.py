@@ -60,9 +60,9 @@ class SimplifiedNewton(AbstractNewton):
         self, problem: Problem, candidate: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], ProjectionInfo]:
         bounds = self.bounds(problem.like)
-        y, ok, count, _ = along_gradients(bounds, problem, candidate, max_steps=self.max_steps)
+        y, ok, count, known = along_gradients(bounds, problem, candidate, max_steps=self.max_steps)
         y = y if bounds is None else bounds.clip(y)
-        return y, problem.report(candidate, y, count, ok=ok)
+        return y, problem.report(candidate, y, count, ok=ok, linearised=known)
 
 
 SimplifiedNewton.__init__.__doc__ = NEWTON_OPTIONS

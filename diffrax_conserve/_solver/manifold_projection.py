@@ -279,8 +279,11 @@ class ManifoldProjection(ForwardingSolver):
         # The dense output of the step is rarely needed, so it is made when it is called.
         interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         interpolant = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
+        # A projection evaluates functions at the candidate at several places. Without a barrier
+        # before all of them, XLA would not see that they are the same.
+        candidate = lax.optimization_barrier(ravel(y1))
         return _WrappedStep(
-            step, ravel(y1), interpolant, error, dense_info, inner, result, field_time
+            step, candidate, interpolant, error, dense_info, inner, result, field_time
         )
 
     @property
