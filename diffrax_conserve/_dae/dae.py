@@ -597,7 +597,10 @@ def _found(
             f"them. {lacking} Leave out what is stated twice, and add the equation that is missing."
         )
         # At a poor guess a rank may be lost by roundoff: then no equation is to blame.
-        hidden = "near this state roundoff hides how they depend on the unknowns. Give another one."
+        hidden = (
+            "near this state roundoff hides how they depend on the unknowns. Give another one; if "
+            "they are singular there too, an equation follows from others: leave it out."
+        )
         raise ValueError(
             f"The equations are singular: {repeated if error.left else hidden}{elsewhere}"
         ) from None

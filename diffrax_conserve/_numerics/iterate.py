@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.lax as lax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -293,13 +292,15 @@ def _with_frozen_jacobian(
             moved = lax.cond(any_lane(tests_left > 0), move, lambda: y)
             return where_active(tests_left, moved, y), tests_left
 
-        steps = jnp.minimum(FROZEN_STEPS, max_steps - now.num_iterations)
+        steps = jnp.where(now.goes_on, jnp.minimum(FROZEN_STEPS, max_steps - now.num_iterations), 0)
         moved, _, count, _ = iterate(advance, y, max_steps=steps)
-        linearised, count = problem.linearise(moved), now.num_iterations + count
+        moved = jnp.where(now.goes_on, moved, y)
+        linearised = problem.linearise(moved)
         ok = problem.holds(moved, *linearised)
-        hopeful = (count > now.num_iterations) & (count < max_steps) & jnp.all(jnp.isfinite(moved))
-        new = _Rounds(moved, linearised, ok, count, ~ok & hopeful)
-        return jtu.tree_map(ft.partial(jnp.where, now.goes_on), new, now)
+        hopeful = (count > 0) & jnp.all(jnp.isfinite(moved))
+        count = now.num_iterations + count
+        goes_on = now.goes_on & ~ok & hopeful & (count < max_steps)
+        return _Rounds(moved, linearised, ok, count, goes_on)
 
     no, yes, none = jnp.asarray(False), jnp.asarray(True), jnp.asarray(0)
     begin = _Rounds(candidate, problem.linearise(candidate), no, none, yes)

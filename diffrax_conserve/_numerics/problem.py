@@ -26,7 +26,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from .._constants import NOISE_IN_EPS, TOLERANCE_IN_EPS
+from .._constants import MAX_ELIMINATION, NOISE_IN_EPS, TOLERANCE_IN_EPS
 from .._custom_types import Args, IntScalarLike, Manifold, RealScalarLike, Values, Y
 from .._large.sparse import Pattern, pattern_of
 from .._manifold import at_full_precision, entry_names, evaluate, is_entry
@@ -236,10 +236,11 @@ class Problem(eqx.Module):
 
 
 def linearised(fn: Residual, y: Float[Array, " n"]) -> tuple[Array, Float[Array, "m n"]]:
-    """The values of a function and its Jacobian. With many values, as those of all constraints of a
-    mechanism, in forward mode: reverse mode compiled twice as long and took as long."""
+    """The values of a function and its Jacobian; in forward mode if there are many values and not
+    many more unknowns, as for a mechanism in space: reverse mode compiled twice as long and took as
+    long."""
     size = jax.eval_shape(fn, y).size
-    if 2 * size > y.size > 1:
+    if size > MAX_ELIMINATION and 2 * size > y.size:
         pushed = jax.vmap(lambda v: jax.jvp(fn, (y,), (v,)), out_axes=(None, 1))
         return pushed(np.eye(y.size, dtype=y.dtype))
     value, vjp = jax.vjp(fn, y)

@@ -6,8 +6,8 @@ gradient tell, and a tolerance made from them alone could not be met.
 
 So we make a first-order error analysis by reverse differentiation (S. Linnainmaa, "Taylor expansion
 of the accumulated rounding error", *BIT* 16 (1976), 146-160): an error `δ` of an intermediate value
-changes the result by `δ` times the adjoint of that value. A function with more than a few results,
-each of which would cost a reverse pass, is evaluated with errors instead; see `_sampled`.
+changes the result by `δ` times the adjoint of that value. A large function is evaluated with errors
+instead; see `_sampled`.
 
 - The error of a sum is about one unit of roundoff of the sizes of its terms. That of a cast, or of
   the operand of a function such as the sine, is one unit of roundoff of its own size.
@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._constants import MAX_PIVOTED
+from .._constants import MAX_SCALAR_OPERATIONS, MIN_SPARSE
 from .._custom_types import Args, Manifold, RealScalarLike, Y
-from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, outputs, walk
+from .._fast.jaxprs import carried, closed_jaxpr, jaxprs_inside, num_equations, outputs, walk
 from .._large.sparse import pattern_of
 from .._manifold import named_entries, noting_call_of
 from .._tree import eps_of, ravel, tree_stop_gradient
@@ -77,23 +77,32 @@ def cancellation_scale(
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
         measured = []
-        for ((name, _), fn), size in zip(entries, sizes, strict=True):
+        for (name, _), fn in entries:
             with noting_call_of(name, t, y, args):  # JAX refuses to differentiate some loops
-                if size <= MAX_PIVOTED:
-                    measured.append(cancellation_terms(fn, vector))
-                else:
+                if _is_large(fn, vector):
                     measured.append((*linearised(fn, vector), _sampled(fn, vector)))
+                else:
+                    measured.append(cancellation_terms(fn, vector))
         value, matrix, cancellation = (jnp.concatenate(x) for x in zip(*measured, strict=True))
         jacobian = DenseRows(matrix)
     else:
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
         measured = [
-            cancellation_terms(fn, vector)[2] if size <= MAX_PIVOTED else _sampled(fn, vector)
-            for fn, size in zip(functions, sizes, strict=True)
+            _sampled(fn, vector) if _is_large(fn, vector) else cancellation_terms(fn, vector)[2]
+            for fn in functions
         ]
         cancellation = jnp.concatenate(measured)
     gradient_scale = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
     return gradient_scale, jacobian, jnp.where(cancellation <= gradient_scale, 0, cancellation)
+
+
+def _is_large(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> bool:
+    """Whether a function has many results, each of which would cost a reverse pass, or many
+    operations: the reverse pass over two thousand of them, as of the hidden constraints of a
+    mechanism in space, compiled longer than all the rest of a solve."""
+    closed = jax.make_jaxpr(fn)(y)
+    (result,) = closed.out_avals
+    return result.size >= MIN_SPARSE or num_equations(closed) > MAX_SCALAR_OPERATIONS // 4  # pyright: ignore
 
 
 def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
@@ -121,8 +130,7 @@ def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _
 
 
 def _sampled(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> Float[Array, " m"]:
-    """The error of `fn` at `y` by roundoff, divided by `ε`, for several results, each of which
-    would cost a reverse pass.
+    """The error of a large `fn` at `y` by roundoff, divided by `ε`.
 
     Each rounded value is moved by `√ε` of its size, times a number in general position whose mean
     square is one, and so the results are moved by `√ε` times the root of the sum of the squares. It
@@ -145,7 +153,7 @@ def _sampled(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> Float[Array
 
     frequencies, phases = np.repeat(np.sqrt([1, 2, 3, 5]), 2), np.tile([0, np.pi / 2], 4)
     samples = frequencies.astype(y.dtype), phases.astype(y.dtype)
-    changes = jax.lax.map(moved, samples) - fn(y)  # `vmap` compiled three times as long
+    changes = jax.lax.map(moved, samples) - fn(y)[None]  # `vmap` compiled three times as long
     # As in `_adjoint`, what is not finite says nothing of roundoff.
     changes = jnp.where(jnp.isfinite(changes), changes / share, 0)
     return jnp.sqrt(jnp.mean(changes**2, axis=0))

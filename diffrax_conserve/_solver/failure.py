@@ -41,7 +41,7 @@ FIRST_RESULT = register(
     "`diffrax.PIDController` does, or pass `projection=diffrax_conserve.Newton()` to a "
     "`ManifoldProjection`, which copes with far candidates. Check by `check_invariance` that the "
     "quantity is conserved at all. If terms that cancel inside `fn` have grown since the start, "
-    "pass `atol`. " + _ENTRY,
+    "pass a projection with `atol`. " + _ENTRY,
     "the projection of a step failed: the manifold was not reached, by the first step or however "
     "short a step. What is asked for may contradict itself: a `value` that no state has, `lower` "
     "or `upper` that exclude the manifold, or entries that exclude each other, such as all "
