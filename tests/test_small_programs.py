@@ -226,3 +226,12 @@ def test_many_constraints_are_linearised_once_where_a_state_is_the_same():
         return solver.step(term, 0.0, 0.1, y, None, state, False)[0]
 
     assert num_calls("linearise", jax.make_jaxpr(step)(jnp.linspace(1.0, 2.0, 30))) == 3
+
+
+def test_many_constraints_may_have_a_rule_for_reverse_mode_alone():
+    square = jax.custom_vjp(lambda y: y**2)
+    square.defvjp(lambda y: (y**2, y), lambda y, given: (2 * y * given,))
+    squares = dfc.FirstIntegral(lambda t, y, args: square(y[:20]))
+    y, info = dfc.project(squares, jnp.linspace(1.0, 2.0, 30), value=jnp.linspace(1.1, 4.0, 20))
+    assert info.ok
+    np.testing.assert_allclose(y[:20] ** 2, jnp.linspace(1.1, 4.0, 20), rtol=1e-15)

@@ -236,13 +236,16 @@ class Problem(eqx.Module):
 
 
 def linearised(fn: Residual, y: Float[Array, " n"]) -> tuple[Array, Float[Array, "m n"]]:
-    """The values of a function and its Jacobian; in forward mode if there are many values and not
-    many more unknowns, as for a mechanism in space: reverse mode compiled twice as long and took as
-    long."""
+    """The values of a function and its Jacobian. With many values and not many more unknowns, as of
+    a mechanism in space, it is found in forward mode: reverse mode compiled twice as long and took
+    as long."""
     size = jax.eval_shape(fn, y).size
     if size > MAX_ELIMINATION and 2 * size > y.size:
-        pushed = jax.vmap(lambda v: jax.jvp(fn, (y,), (v,)), out_axes=(None, 1))
-        return pushed(np.eye(y.size, dtype=y.dtype))
+        along = jax.vmap(lambda v: jax.jvp(fn, (y,), (v,)), out_axes=(None, 1))
+        try:
+            return along(np.eye(y.size, dtype=y.dtype))
+        except TypeError:  # by a function that has a rule for reverse mode alone
+            pass
     value, vjp = jax.vjp(fn, y)
     if size == 1:
         return value, vjp(jnp.ones_like(value))[0][None]

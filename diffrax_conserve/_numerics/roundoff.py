@@ -70,16 +70,17 @@ def cancellation_scale(
     manifold, t, y, args = tree_stop_gradient((manifold, t, y, args))
     vector = ravel(y)
     functions = functions_of(manifold, t, y, args)
-    entries, sizes = [*zip(named_entries(manifold), functions, strict=True)], []
-    for (name, _), fn in entries:
+    names, programs = [name for name, _ in named_entries(manifold)], []
+    for name, fn in zip(names, functions, strict=True):
         with noting_call_of(name, t, y, args):
-            sizes.append(jax.eval_shape(fn, vector).size)
+            programs.append(jax.make_jaxpr(fn)(vector))
+    sizes, large = [x.out_avals[0].size for x in programs], [*map(_is_large, programs)]  # pyright: ignore
     pattern = pattern_of(functions, sizes, vector)
     if pattern is None:
         measured = []
-        for (name, _), fn in entries:
+        for name, fn, is_large in zip(names, functions, large, strict=True):
             with noting_call_of(name, t, y, args):  # JAX refuses to differentiate some loops
-                if _is_large(fn, vector):
+                if is_large:
                     measured.append((*linearised(fn, vector), _sampled(fn, vector)))
                 else:
                     measured.append(cancellation_terms(fn, vector))
@@ -88,21 +89,20 @@ def cancellation_scale(
     else:
         value, jacobian = SparseRows.linearised(pattern, functions, vector)
         measured = [
-            _sampled(fn, vector) if _is_large(fn, vector) else cancellation_terms(fn, vector)[2]
-            for fn in functions
+            _sampled(fn, vector) if is_large else cancellation_terms(fn, vector)[2]
+            for fn, is_large in zip(functions, large, strict=True)
         ]
         cancellation = jnp.concatenate(measured)
     gradient_scale = jnp.abs(value) + jacobian.absolute_matvec(jnp.abs(vector))
     return gradient_scale, jacobian, jnp.where(cancellation <= gradient_scale, 0, cancellation)
 
 
-def _is_large(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> bool:
+def _is_large(program: Any) -> bool:
     """Whether a function has many results, each of which would cost a reverse pass, or many
     operations: the reverse pass over two thousand of them, as of the hidden constraints of a
     mechanism in space, compiled longer than all the rest of a solve."""
-    closed = jax.make_jaxpr(fn)(y)
-    (result,) = closed.out_avals
-    return result.size >= MIN_SPARSE or num_equations(closed) > MAX_SCALAR_OPERATIONS // 4  # pyright: ignore
+    many = program.out_avals[0].size >= MIN_SPARSE
+    return many or num_equations(program) > MAX_SCALAR_OPERATIONS // 4
 
 
 def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _Measured:
@@ -115,7 +115,9 @@ def cancellation_terms(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> _
     closed = jax.make_jaxpr(fn)(y)
 
     def evaluate(y: Array, *sums: Array) -> Array:
-        return _with_roundoff(closed, [(y, _STATE)], lambda x, size: _rounded(x, size, *sums))[0][0]
+        return _with_roundoff(closed, [(y, _STATE)], lambda x, size, *_: _rounded(x, size, *sums))[
+            0
+        ][0]
 
     value, vjp = jax.vjp(evaluate, y, *jnp.zeros(2, y.dtype))
     one = jnp.eye(value.size, dtype=value.dtype)
@@ -142,9 +144,10 @@ def _sampled(fn: Callable[[Array], Array], y: Float[Array, " n"]) -> Float[Array
     def moved(sample: tuple[Array, Array]) -> Float[Array, " m"]:
         (frequency, phase), count = sample, it.count(1)
 
-        def with_error(x: Array, size: Array) -> Array:
+        def with_error(x: Array, size: Array, step: Array | int = 0) -> Array:
             places = np.arange(1, x.size + 1, dtype=float).reshape(x.shape) ** 2 + next(count) ** 2
             angle = jnp.asarray(np.mod(places, 2 * np.pi), y.dtype)  # float32 would lose the phase
+            angle = angle + jnp.asarray(step, y.dtype) ** 2
             weight = 2**0.5 * jnp.sin(frequency * angle + phase)
             unit = share * eps_of(x) / eps_of(y)
             return x + (unit * weight * size).astype(x.dtype)
@@ -185,15 +188,13 @@ _rounded.defvjp(lambda x, size, total, squares: (x, (size, total)), _adjoint)
 _Pair = tuple[Any, int]  # a value, and how it depends on the state
 
 
-def _with_roundoff(
-    closed: Any, given: list[_Pair], with_error: Callable[[Any, Any], Any]
-) -> list[_Pair]:
-    """The values of a jaxpr in which `with_error(x, size)` takes the place of each `x` that has an
-    error of its own, of one unit of roundoff of `size`."""
+def _with_roundoff(closed: Any, given: list[_Pair], with_error: Callable[..., Any]) -> list[_Pair]:
+    """The values of a jaxpr in which `with_error(x, size)`, in a scan `with_error(x, size, step)`,
+    takes the place of each `x` that has an error of its own, of one unit of roundoff of `size`."""
     return walk(closed, given, lambda x: (x, _CONSTANT), ft.partial(_equation, with_error))
 
 
-def _equation(with_error: Callable[[Any, Any], Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
+def _equation(with_error: Callable[..., Any], eqn: Any, given: list[_Pair]) -> list[_Pair]:
     """The values of one equation of a jaxpr, by the rules at the head of this file."""
     name, params = eqn.primitive.name, eqn.params
     inputs, dependence = [x for x, _ in given], max((each for _, each in given), default=_CONSTANT)
@@ -232,23 +233,25 @@ def _is_inexact(*xs: Any) -> bool:
     return all(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in xs)
 
 
-def _values(with_error: Callable[[Any, Any], Any], closed: Any, *inputs: Any) -> list[Any]:
+def _values(with_error: Callable[..., Any], closed: Any, *inputs: Any) -> list[Any]:
     """As `_with_roundoff`, where all inputs may be computed from the state."""
     return [x for x, _ in _with_roundoff(closed, [(x, _COMPUTED) for x in inputs], with_error)]
 
 
-def _scanned(with_error: Callable[[Any, Any], Any], eqn: Any, inputs: list[Any]) -> list[Any]:
+def _scanned(with_error: Callable[..., Any], eqn: Any, inputs: list[Any]) -> list[Any]:
     params, inside = eqn.params, eqn.params["jaxpr"]
     first, last = carried(eqn)
     num_carry = last - first
 
     # Without a checkpoint, reverse mode would keep the values of each step of a long scan.
     @jax.checkpoint
-    def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
-        outs = _values(with_error, inside, *inputs[:first], *carry, *x)
+    def body(carry: list[Any], now: Any) -> tuple[list[Any], list[Any]]:
+        step, x = now
+        in_step = lambda x, size, *_: with_error(x, size, step)  # noqa: E731
+        outs = _values(in_step, inside, *inputs[:first], *carry, *x)
         return outs[:num_carry], outs[num_carry:]
 
-    given = inputs[first:last], inputs[last:]
+    given = inputs[first:last], (np.arange(params["length"]), inputs[last:])
     carry, ys = jax.lax.scan(body, *given, params["length"], params["reverse"])
     return [*carry, *ys]
 

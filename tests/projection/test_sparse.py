@@ -138,6 +138,17 @@ def test_the_roundoff_of_many_residuals_is_that_of_each_alone(shift: float, size
     assert jnp.all((ratio > 0.4) & (ratio < 2.5)), ratio
 
 
+def test_the_roundoff_of_the_steps_of_a_scan_is_independent():
+    y = jnp.linspace(0.5, 1.5, 400)
+
+    def fn(y: Array) -> Array:
+        add = lambda total, x: (total + 1e3 * jnp.cos(x) - 1e3, None)  # noqa: E731
+        return jax.lax.scan(add, jnp.zeros(()), y)[0][None]
+
+    ratio = _sampled(fn, y) / cancellation_terms(fn, y)[2]
+    assert 0.4 < ratio[0] < 2.5
+
+
 @pytest.mark.slow
 @some_of("name", ["spins", "lattice", "ring"], period=3)
 def test_derivatives_are_those_by_differences(name: str):
