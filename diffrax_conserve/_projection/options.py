@@ -41,10 +41,10 @@ NEWTON_OPTIONS = r"""**Arguments:**
 - `lower`, `upper`: bounds of the components, such as `lower=0` for concentrations: numbers, arrays
     or PyTrees that broadcast like `metric`. The result, always within the bounds, is
     $\mathrm{clip}(\hat y + M^{-1} G^\top \lambda)$, for linear constraints and a metric without
-    matrices the nearest such point of the manifold. If there is none, the projection fails. A start
-    that is outside is moved by the first projection. In derivatives, components that were beyond a
-    bound are constant, and those exactly at one move with $\hat y$. Of a complex component both
-    parts are bounded. Default: none.
+    matrices the nearest such point of the manifold. If no such point is on it, the projection
+    fails. A start that is outside is moved by the first projection. In derivatives, components that
+    were beyond a bound are constant, and those exactly at one move with $\hat y$. Of a complex
+    component both parts are bounded. Default: none.
 
 **Raises:**
 
