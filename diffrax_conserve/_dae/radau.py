@@ -208,7 +208,10 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
                 # A change by the roundoff of the state cannot become smaller.
                 rounded = now_size <= size(TOLERANCE_IN_EPS * eps_of(new) * new, new)
                 converged = rounded | ((rate < 1) & (now_size * rate / (1 - rate) < finder.kappa))
-                then = remaining_after_step(converged, rate < 2, tests_left)
+                # From a consistent start forces hardly change at first. The second change, by the
+                # curvature of their constraints, may exceed the first one and still converge.
+                hopeful = (rate < 2) | (tests_left >= self.root_find_max_steps)
+                then = remaining_after_step(converged, hopeful, tests_left)
                 return where_active(tests_left, (new, now_size), now), then
 
             begin = guess, jnp.asarray(jnp.inf, start.dtype)

@@ -266,3 +266,32 @@ def test_cells_in_parallel_share_the_current(solver, names):
     exact = np.full(2, slope), np.array([11.0, -11.0]) / total**2, -0.75 * slope
     for a, b in zip(by_first, exact, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-11)
+
+
+def test_forces_that_hardly_change_at_first_do_not_end_the_iteration_of_a_stage():
+    """Three rods fall from rest. From a consistent start the first change of the iteration is small
+    beside the second, by the curvature of the constraints."""
+
+    def rods(q):
+        return jnp.diff(q, axis=0, prepend=jnp.zeros((1, 2)))
+
+    def falling(t, y, dy, args):
+        (q, v, tension), (dq, dv, _) = y, dy
+        pull = tension[:, None] * rods(q)
+        force = pull - jnp.concatenate([pull[1:], jnp.zeros((1, 2))])
+        return dq - v, dv + force - jnp.array([0.0, -9.81]), jnp.sum(rods(q) ** 2, axis=1) - 1 / 9
+
+    dae, angles = dfc.DAE(residual=falling), jnp.array([0.0, 0.1, 0.2])
+    q = jnp.cumsum(jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1) / 3, axis=0)
+    y0 = dae.consistent((q, jnp.zeros((3, 2)), jnp.ones(3)))
+    finder = dfx.VeryChord(rtol=1e-8, atol=1e-8)
+
+    @jax.jit
+    def end(step):
+        solver = dae.wrap(dfc.Radau(root_finder=finder))
+        sol = dfx.diffeqsolve(dae.term, solver, 0.0, 0.1, step, y0, max_steps=256, throw=False)
+        return sol.ys[0][-1], sol.result == dfx.RESULTS.successful
+
+    (coarse, ok), (fine, _) = end(0.02), end(5e-4)
+    assert ok
+    np.testing.assert_allclose(coarse, fine, atol=1e-6)
