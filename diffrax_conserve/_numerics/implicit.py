@@ -129,19 +129,18 @@ class MultiplierSystem(AbstractSystem):
         y = jnp.where(solved.ok, solved.y, start)
         change = self.problem.factor.to_euclidean(y - start)
         if self.corrected is None:
-            norms, rows = self._directions_at(start).normalised()
-            return solved.ok, rows.least_squares_multiplier(change) / norms
-        # Of the other components the derivative is not that of `ŷ + S Uᵀ λ`.
-        _, rows, norms, directions, _ = self._linearised(y, start)
-        gram, tolerance = rows.gram(directions), rows.derivative_pivot_tolerance()
-        multiplier = gram.solve(rows.matvec(change), pivot_tolerance=tolerance)
-        return solved.ok, multiplier / norms
+            norms, directions = self._directions_at(start).normalised()
+            rows = directions
+        else:  # of components that are not corrected the derivative is not that of `ŷ + S Uᵀ λ`
+            _, rows, norms, directions, _ = self._linearised(y, start)
+        return solved.ok, rows.multiplier(change, directions) / norms
 
     def _linearised(
         self, y: Array, start: Array
     ) -> tuple[Array, AbstractRows, Array, AbstractRows, Array | bool]:
         """The norms of the rows `G(y) S`, and the rows divided by them; likewise the directions;
-        and which components of the state are corrected. Others are zero in both."""
+        and which components of the state are corrected. Others are zero in the rows. In directions
+        they are too unless the metric is a matrix, so that norms are of what is corrected."""
         factor, corrected = self.problem.factor, True
         jacobian, directions = self.problem.linearise(y)[1], self._directions_at(start)
         if self.corrected is not None:

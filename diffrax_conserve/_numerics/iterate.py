@@ -236,9 +236,6 @@ def _newton_of_few_constraints(
         moved, *kept = lax.cond(any_lane(tests_left > 0), move, lambda: now) if branch else move()
         return [where_active(tests_left, moved, y), *kept], tests_left
 
-    # The candidate is the end of a step of the solver. Without a barrier XLA would evaluate that
-    # step once for each use of the candidate.
-    candidate = lax.optimization_barrier(candidate)
     n, *lanes = candidate.shape
     if has_directions:
         begin = [candidate, map_lanes(lambda given, y: given[1].matrix)(candidate)]
@@ -294,7 +291,6 @@ def _with_frozen_jacobian(
 
         steps = jnp.where(now.goes_on, jnp.minimum(FROZEN_STEPS, max_steps - now.num_iterations), 0)
         moved, _, count, _ = iterate(advance, y, max_steps=steps)
-        moved = jnp.where(now.goes_on, moved, y)
         linearised = problem.linearise(moved)
         ok = problem.holds(moved, *linearised)
         hopeful = (count > 0) & jnp.all(jnp.isfinite(moved))
@@ -302,8 +298,13 @@ def _with_frozen_jacobian(
         goes_on = now.goes_on & ~ok & hopeful & (count < max_steps)
         return _Rounds(moved, linearised, ok, count, goes_on)
 
-    no, yes, none = jnp.asarray(False), jnp.asarray(True), jnp.asarray(0)
-    begin = _Rounds(candidate, problem.linearise(candidate), no, none, yes)
+    begin = _Rounds(
+        candidate,
+        problem.linearise(candidate),
+        ok=jnp.asarray(False),
+        num_iterations=jnp.asarray(0),
+        goes_on=jnp.asarray(True),
+    )
     end = lax.while_loop(lambda now: any_lane(now.goes_on), linearised_once, begin)
     return Solved(end.y, end.ok, end.num_iterations, end.linearised)
 

@@ -237,8 +237,8 @@ class Problem(eqx.Module):
 
 def linearised(fn: Residual, y: Float[Array, " n"]) -> tuple[Array, Float[Array, "m n"]]:
     """The values of a function and its Jacobian. With many values and not many more unknowns, as of
-    a mechanism in space, it is found in forward mode: reverse mode compiled twice as long and took
-    as long."""
+    a mechanism in space, it is found in forward mode: there reverse mode compiled up to twice as
+    long, and took as long."""
     size = jax.eval_shape(fn, y).size
     if size > MAX_ELIMINATION and 2 * size > y.size:
         along = jax.vmap(lambda v: jax.jvp(fn, (y,), (v,)), out_axes=(None, 1))

@@ -100,7 +100,7 @@ def cancellation_scale(
 def _is_large(program: Any) -> bool:
     """Whether a function has many results, each of which would cost a reverse pass, or many
     operations: the reverse pass over two thousand of them, as of the hidden constraints of a
-    mechanism in space, compiled longer than all the rest of a solve."""
+    mechanism in space, was a third of the time to compile a solve."""
     many = program.out_avals[0].size >= MIN_SPARSE
     return many or num_equations(program) > MAX_SCALAR_OPERATIONS // 4
 

@@ -140,9 +140,10 @@ class AbstractRows(eqx.Module):
         error of about `ε`, half of the digits of what is divided by it are right."""
         return eps_of(self.dtype) ** 0.5
 
-    def least_squares_multiplier(self, change: Float[Array, " n"]) -> Float[Array, " m"]:
-        """The `λ` for which `Uᵀ λ` is nearest to a change, without nearly dependent rows."""
-        return self.gram(self).solve(
+    def multiplier(self, change: Float[Array, " n"], directions: Any) -> Float[Array, " m"]:
+        """The `λ` for which `U Vᵀ λ = U change`, without nearly dependent rows. With its own rows
+        as the `directions`, the rows `V`, the change `Uᵀ λ` is the nearest to the given one."""
+        return self.gram(directions).solve(
             self.matvec(change), pivot_tolerance=self.derivative_pivot_tolerance()
         )
 

@@ -154,7 +154,7 @@ def _conditions(given: _Given, base: Float[Array, " n"]) -> tuple[_Conditions, A
     )
     return (
         conditions,
-        jnp.concatenate([jnp.zeros_like(y), rows.least_squares_multiplier(change)]),
+        jnp.concatenate([jnp.zeros_like(y), rows.multiplier(change, rows)]),
         tested,
     )
 

@@ -279,8 +279,8 @@ class ManifoldProjection(ForwardingSolver):
         # The dense output of the step is rarely needed, so it is made when it is called.
         interpolation = ft.partial(self.solver.interpolation_cls, t0=t0, t1=t1, **dense_info)
         interpolant = lambda t: ravel(interpolation().evaluate(field_time(t)))  # noqa: E731
-        # A projection evaluates functions at the candidate at several places. Without a barrier
-        # before all of them, XLA would not see that they are the same.
+        # A projection evaluates functions at the candidate at several places. Without a barrier XLA
+        # would evaluate the step once for each of them.
         candidate = lax.optimization_barrier(ravel(y1))
         return _WrappedStep(
             step, candidate, interpolant, error, dense_info, inner, result, field_time
