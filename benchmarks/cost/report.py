@@ -1,5 +1,5 @@
 """From the results of `make bench`: tables of the documentation, and the figures of the pages on
-performance and on differential-algebraic equations.
+performance and on Radau.
 
 Prints the tables; `--write` puts each between its two markers and redraws the figures. A test holds
 the tables of the pages to the results.
@@ -19,7 +19,7 @@ from matplotlib.ticker import LogLocator
 
 ROOT = measuring.HERE.parent.parent
 DOCS = ROOT / "docs"
-FILES = ("performance", "many-constraints", "differential-algebraic", "large-stiff")
+FILES = ("performance", "many-constraints", "radau", "large-stiff")
 PAGES = [DOCS / f"{x}.md" for x in FILES]
 NAMES = ("scaling", "many_constraints", "dae", "large", "compiler_option")
 # Of each system: the integrals that are kept, and the numbers in its state.
