@@ -152,7 +152,7 @@ def ldu_factors(
         matrix = jnp.where(is_remaining[:, None] | is_remaining[None], rest, matrix)
         return matrix, pivot_step + is_k.astype(int) * (k - m)
 
-    pivot_step = np.full((m, *lanes) if pivoting else j.shape, m)
+    pivot_step = jnp.full((m, *lanes) if pivoting else j.shape, m)
     if m > 1:  # all relative pivots are one, so that the natural order will do
         matrix, pivot_step = eliminate(0, (matrix, pivot_step), False)
     if m > 2:

@@ -8,11 +8,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from .._custom_types import RealScalarLike
-from .._tree import eps_of
+from .._tree import eps_of, ravel, unravel
 
 
 def assert_gradients(
@@ -33,12 +32,13 @@ def assert_gradients(
 
     **Arguments:**
 
-    - `f`: a function of PyTrees that returns a PyTree of real arrays. It is compiled. In a solve,
-        use fixed steps: changes of adaptive steps affect the differences but not the derivatives.
-    - `*args`: the arguments at which to differentiate. Floating-point arrays and numbers are
-        varied, also those in an [`equinox.Module`][]; everything else is constant.
+    - `f`: a function of PyTrees that returns a PyTree. It is compiled. In a solve, use fixed steps:
+        changes of adaptive steps affect the differences but not the derivatives.
+    - `*args`: the arguments at which to differentiate. Floating-point and complex arrays and
+        numbers are varied, also those in an [`equinox.Module`][]; everything else is constant. A
+        complex number is two, its real and its imaginary part.
     - `rtol`: relative to the sum of the absolute terms of $w^\top J v$. Default: the square root of
-        the machine epsilon, 1.5e-8 in float64.
+        the machine epsilon, 1.5e-8 in float64, of the coarsest dtype in `args` and in the result.
     - `atol`: absolute. Default: `rtol` times the largest output, the resolution of the differences.
     - `forward`, `reverse`: whether to check these modes. The default adjoint of `diffeqsolve` has
         no forward mode, and `diffrax.ForwardMode` no reverse mode.
@@ -60,28 +60,28 @@ def assert_gradients(
         dct.assert_gradients(lambda y: dfc.project(circle, y)[0], jnp.array([3.0, 4.0]), rtol=1e-2)
         ```
     """
-    args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float) else x, args)
+    args = jtu.tree_map(lambda x: jnp.asarray(x) if isinstance(x, float | complex) else x, args)
     varied, fixed = eqx.partition(args, eqx.is_inexact_array)
     names = [f"args{jtu.keystr(path)}" for path, _ in jtu.tree_flatten_with_path(varied)[0]]
     if not names:
         raise ValueError("`args` holds no floating-point array, so there is nothing to vary.")
     # The leaves in one vector, and to which of them each number belongs.
-    x, restore = ravel_pytree(varied)
-    leaf = np.repeat(np.arange(len(names)), [leaf.size for leaf in jtu.tree_leaves(varied)])
+    x, leaves = ravel(varied), jtu.tree_leaves(varied)
+    leaf = np.repeat(np.arange(len(names)), [ravel(leaf).size for leaf in leaves])
 
     @jax.jit
-    def value(x: Array) -> Array:
-        out = f(*eqx.combine(restore(x), fixed))
-        return ravel_pytree(eqx.filter(out, eqx.is_inexact_array))[0]
+    def values(x: Array) -> Any:
+        return eqx.filter(f(*eqx.combine(unravel(x, varied), fixed)), eqx.is_inexact_array)
 
+    value = lambda x: ravel(values(x))  # noqa: E731
     rng = np.random.default_rng(seed)
     output = value(x)
+    eps = max(map(eps_of, jtu.tree_leaves((varied, values(x)))))
     cotangent = jnp.asarray(rng.normal(size=output.shape), output.dtype)
     pullback = jax.jit(lambda x: jax.vjp(value, x)[1](cotangent)[0])
     by_reverse = pullback(x) if reverse else jnp.zeros_like(x)
     pushforward = jax.jit(lambda x, v: jax.jvp(value, (x,), (v,))[1])
     direction = rng.normal(size=x.shape)
-    eps = eps_of(x)
     relative = eps**0.5 if rtol is None else float(rtol)
     floor = relative * float(jnp.max(jnp.abs(output), initial=0)) if atol is None else float(atol)
     lines = []

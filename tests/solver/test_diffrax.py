@@ -3,6 +3,7 @@
 import diffrax as dfx
 import equinox as eqx
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -47,6 +48,14 @@ def test_adjoints_agree(backwards, forwards):
     expected = (plus - minus) / 2e-5
     np.testing.assert_allclose(reverse @ direction, weights @ expected, rtol=0, atol=1e-8)
     np.testing.assert_allclose(forward, expected, rtol=0, atol=1e-8)
+
+
+def test_a_batch_whose_size_is_not_known_yet_is_exported():
+    final = jax.vmap(lambda y0: solve(rigid_body, BALL, y0, t1=0.5, throw=False).ys[-1])
+    like = jax.ShapeDtypeStruct((*jax.export.symbolic_shape("lanes"), 3), OMEGA0.dtype)
+    starts = jnp.stack([OMEGA0, 2 * OMEGA0])
+    exported = jax.export.export(jax.jit(final))(like)
+    np.testing.assert_allclose(exported.call(starts), final(starts), rtol=1e-15)
 
 
 CIRCLE = dfc.FirstIntegral(lambda t, y, args: jnp.sum(y**2))

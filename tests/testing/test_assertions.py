@@ -135,6 +135,15 @@ def test_wrong_gradients_are_found_and_the_argument_is_named():
     assert "forward mode" not in fails(dct.assert_gradients, f, y, forward=False)
 
 
+def test_right_gradients_of_mixed_precision_and_of_complex_numbers_pass():
+    single, number = OMEGA0.astype(jnp.float32), jnp.asarray(2.0)
+    dct.assert_gradients(lambda y, a: a * jnp.sum(y), single, number)
+    dct.assert_gradients(lambda y: jnp.sum(y).astype(jnp.float32) ** 2, OMEGA0)
+    dct.assert_gradients(lambda z: (jnp.abs(z) ** 2, z**2), OMEGA0 + 1j)
+    half = lambda z: jnp.abs(jax.lax.complex(z.real, jax.lax.stop_gradient(z.imag)))  # noqa: E731
+    assert "`args[0]`" in fails(dct.assert_gradients, half, OMEGA0 + 1j)
+
+
 def test_nothing_to_check_is_an_error():
     sol = solve(PROJECTED)
     empty = dataclasses.replace(sol, ts=None, ys=None)

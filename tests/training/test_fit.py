@@ -167,7 +167,14 @@ test_mistakes_are_named = refused(
     (lambda: refuse(LAYER), TypeError, "max_step"),
     (lambda: refuse(Still(), sample=LORENZ.sample), ValueError, "no weights of its"),
     (lambda: refuse(flow_map(), manifold=RADIUS, **TAYLOR), ValueError, "ManifoldProjection"),
-    (lambda: refuse(in_single(flow_map()), **TAYLOR), TypeError, "Train it in double precision"),
+    (lambda: refuse(in_single(flow_map()), **TAYLOR), TypeError, "states are float64. Give"),
+    (
+        lambda: refuse(
+            dfc.DeepONet(jnp.eye(2, dtype=jnp.float32), 0.5, key=KEY, **SMALL), sample=jnp.eye(2)
+        ),
+        TypeError,
+        "weights of the model are float32",
+    ),
     (lambda: refuse(data=(jnp.ones(2), jnp.ones(2))), ValueError, "and `data` out"),
     (lambda: refuse(recipe="adam"), TypeError, "`recipe` is "),
     (lambda: refuse(recipe=optax.adam(1e-3)), TypeError, "`recipe` is "),

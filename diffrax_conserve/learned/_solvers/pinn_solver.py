@@ -39,7 +39,7 @@ class PINNSolver(Hashable, dfx.AbstractSolver[Refused]):
     are saved, projected or tested for events. The solve must start on the network's solution,
     $y(t_0) = u(t_0)$, and stay inside its interval; otherwise it fails. Dense output is the
     polynomial through the states at 12 Chebyshev points of the step. The derivative with respect to
-    `y0` is zero.
+    `y0` is zero; with a projection it is that through the conserved values alone.
 
     !!! example
 

@@ -92,6 +92,7 @@ def checked(
     else:
         network, problem = _of_flow_map(model, vector_field, sample, data, args, recipe)
     starts = network.starts(problem.draw(network, jr.split(key)[0]))
+    _check_precision(model, starts.y0s)
     if vector_field is not None:
         _check_field(network, problem, starts)
     if network.layer is not None:
@@ -111,13 +112,6 @@ def _of_flow_map(
         raise ValueError(
             f"`fit` was given a {type(model).__name__}, which has no weights of its own. "
             "Train its inner `flow_map` if it has one, and repeat that."
-        )
-    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
-    networks = filter(is_network, jtu.tree_leaves(model, is_leaf=is_network))
-    if any(network.precision != network.scale.dtype for network in networks):
-        raise TypeError(
-            "The weights of the model are float32, but its states are float64. Train it in double "
-            "precision, and convert its `core` afterwards."
         )
     if sample is None and data is None:
         if not isinstance(flow_map.domain, Box):
@@ -168,6 +162,19 @@ def _rate_of_change(problem: Problem) -> Array:
         return after / jnp.maximum(before, 1e-30)
 
     return jnp.median(jax.vmap(at)(jr.split(jr.key(0), 64)))
+
+
+def _check_precision(model: Any, y0s: Y) -> None:
+    """Raises unless each network has the precision of its states, in which it is trained."""
+    is_network = lambda x: isinstance(x, DeepONet)  # noqa: E731
+    for network in filter(is_network, jtu.tree_leaves(model, is_leaf=is_network)):
+        dtype = jnp.result_type(network.scale, *jtu.tree_leaves(y0s))
+        if network.precision != dtype:
+            raise TypeError(
+                f"The weights of the model are {network.precision}, but its states are {dtype}. "
+                f"Give the states in {network.precision}, or make a model from states in {dtype}. "
+                "To evaluate one in single precision, convert its `core` after the training."
+            )
 
 
 def _check_field(network: Any, problem: Problem, starts: Points) -> None:
