@@ -1,10 +1,12 @@
 """Double precision, a cache of what is compiled, and hypothesis profiles for the whole suite."""
 
+import atexit
 import gc
 import importlib
 import itertools
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import jax
@@ -33,6 +35,27 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
+# JAX 0.10 makes a context of MLIR, with all its dialects, for each program that it lowers: a tenth
+# of the time of these small ones. As in 0.12, ten programs of a thread share one here.
+_mlir = importlib.import_module("jax._src.interpreters.mlir")
+_make_ir_context, _of_thread = _mlir.make_ir_context, threading.local()
+
+
+def _shared_ir_context():
+    if _mlir.ir.Context.current is not None:  # one program inside of another
+        return _make_ir_context()
+    uses = getattr(_of_thread, "uses", 0)
+    if uses % 10 == 0:
+        _of_thread.context = _make_ir_context()
+    _of_thread.uses = uses + 1
+    return _of_thread.context
+
+
+if not hasattr(_mlir, "_thread_local_context"):
+    _mlir.make_ir_context = _shared_ir_context
+# Another twentieth.
+jax.config.update("jax_include_full_tracebacks_in_locations", False)
+
 # A failure makes the outputs NaN, which no test accepts. To raise it takes a callback, and jax does
 # not keep programs with callbacks in its cache.
 _equinox_errors = importlib.import_module("equinox._errors")
@@ -58,8 +81,10 @@ gc.set_threshold(50_000, 20, 100)
 
 
 def pytest_sessionfinish():
-    """What is left ends with the process: pytest would look through it five times, in 5 to 10 s."""
+    """What is left ends with the process: pytest would look through it five times, in 5 to 10 s,
+    and JAX would take it apart."""
     gc.freeze()
+    atexit.unregister(importlib.import_module("jax._src.api").clean_up)
 
 
 settings.register_profile(

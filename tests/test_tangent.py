@@ -182,7 +182,7 @@ test_mistakes_with_bounds_are_named = refused(
 )
 
 
-@pytest.mark.parametrize(("k", "turns"), [(10, 0), (10, 1), (40, 0)])
+@some_of("k, turns", [(10, 0), (10, 1), (40, 0)], period=3)
 def test_a_chain_at_rest_is_pushed_at_its_end(k, turns):
     """If it is straight, each link moves by the square of what moves the next one; if it is like
     stairs, even less. The end and its derivative are those of a plain solve up to its tolerance."""

@@ -6,9 +6,10 @@ import re
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
-import pytest
 
 import diffrax_conserve as dfc
+
+from .thinned import some_of
 
 # As users compile: what does not change in a loop is moved out of it.
 AS_USERS = dict(xla_disable_hlo_passes="", xla_backend_optimization_level="0")
@@ -92,7 +93,7 @@ CASES = [(name, is_gradient) for name in SOLVES for is_gradient in (False, True)
 CASES.remove(("random features", True))
 
 
-@pytest.mark.parametrize(("name", "is_gradient"), CASES)
+@some_of("name, is_gradient", CASES, period=3)
 def test_no_call_of_lapack_is_independent_of_another(name, is_gradient):
     solve = jax.grad(SOLVES[name]) if is_gradient else SOLVES[name]
     batch = jax.jit(jax.vmap(solve), compiler_options=AS_USERS)

@@ -15,7 +15,7 @@ def some_of(
     """
 
     cases = list(cases)
-    ids = map(str, cases) if ids is None else ids
+    ids = map(_name, cases) if ids is None else ids
 
     def decorate(test: Callable) -> Callable:
         first = zlib.crc32(test.__name__.encode()) % period
@@ -30,3 +30,9 @@ def some_of(
         return pytest.mark.parametrize(arguments, params)(test)
 
     return decorate
+
+
+def _name(case: object) -> str:
+    """Of a function or a class its name, which is the same in all workers."""
+    parts = case if isinstance(case, tuple) else (case,)
+    return "-".join(getattr(part, "__name__", str(part)) for part in parts)

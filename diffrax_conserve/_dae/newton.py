@@ -26,11 +26,10 @@ Residual = Callable[[Array], Array]
 
 
 def solve_equilibrated(
-    matrix: Float[Array, "m m"], b: Float[Array, "m *k"], leading: Bool[Array, " m"] | None = None
+    matrix: Float[Array, "m m"], b: Float[Array, "m *k"], leading: Bool[Array, "m m"] | None = None
 ) -> Float[Array, "m *k"]:
-    """`matrix⁻¹ b`, computed in units in which all elements are about one. The units of the
-    equations come from the `leading` columns alone, where a row has an element in one of them; by
-    default from all."""
+    """`matrix⁻¹ b`, computed in units in which all elements are about one. The unit of an equation
+    is that of its `leading` elements alone, where one of them is not zero; by default of all."""
     if len(b) == 1:
         return b / matrix[0]
     rows, columns = lax.stop_gradient(row_and_column_scales(matrix, leading))
@@ -39,7 +38,7 @@ def solve_equilibrated(
 
 
 def row_and_column_scales(
-    jacobian: Float[Array, "m m"], leading: Bool[Array, " m"] | None = None
+    jacobian: Float[Array, "m m"], leading: Bool[Array, "m m"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """The units of equations and unknowns, in which no entry is larger than one."""
     sizes = jnp.abs(jacobian)

@@ -39,6 +39,10 @@ _TO_MODES = np.linalg.inv(_VECTORS)
 # The weights of the increments in the error estimate.
 _ERROR = np.array([-13 - 7 * 6**0.5, -13 + 7 * 6**0.5, -1.0]) / 3
 
+# By default a step after an accepted one is at least this share of it, and one that is much shorter
+# follows a rejected one; with an error estimate of this to the fourth it is as long.
+_SAFETY = 0.9
+
 
 class _Last(NamedTuple):
     """What a step leaves to the next: the coefficients of its polynomial in the share of the step,
@@ -185,6 +189,20 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             scale = finder.atol + finder.rtol * jnp.abs(y)
             return finder.norm(jax.vmap(lambda x: unravel(x, y0))(change / scale))
 
+        def judged(once: Array, twice: Array, end: Array) -> Array:
+            """The error estimate, from the one that is filtered once and the one that is twice.
+
+            The first contains the distance of the start from a solution without transients, which a
+            step damps, but which no shorter step makes smaller. So if it is too large after a step
+            was rejected, the error is as large as the second, in which this is damped. Then the
+            next step is not longer."""
+            largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
+            sizes = (size(error[None], largest[None]) for error in (once, twice))
+            of_once, of_twice = (lax.stop_gradient(x) for x in sizes)
+            was_rejected = length < _SAFETY * last.length
+            enough = jnp.maximum(of_twice, _SAFETY**4) / jnp.where(of_once > 0, of_once, 1)
+            return once * jnp.where(was_rejected & (of_once >= 1), jnp.minimum(enough, 1), 1)
+
         def newton(guess: Array) -> Solved:
             """The stages, and the error estimate."""
             real, pair, freed = systems.solvers(_REAL / length, _PAIR / length)
@@ -222,9 +240,10 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             def filtered(y: Array, before: Array) -> Array:
                 return -real(seen(residual(t0, y, slopes)), after=before)
 
-            first = filtered(start, before=y)
-            error = filtered(start + first, before=first)
-            y, error = freed(error, y, error)
+            once = filtered(start, before=y)
+            twice = filtered(start + once, before=once)
+            y, once, twice = freed(twice, y, once, twice)
+            error = judged(once, twice, y[2])
             return found._replace(y=y, aux=error)
 
         found = root(

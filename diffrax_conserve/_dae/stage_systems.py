@@ -38,12 +38,14 @@ def _stages_solution(matrix: Float[Array, "N N"], b: Float[Array, " N"]) -> Floa
 
     The unit of an unknown without slopes, such as a force, may have any ratio to those of the
     others, and must not decide what is lost by rounding. So, as in `Structure.equilibrated_units`,
-    each row is divided by its largest element of an unknown with slopes, and then each column by
-    its largest element. The blocks off the diagonal are `∂F/∂y'` alone, up to a factor.
+    each row of an equation with slopes is divided by its largest element of an unknown with slopes,
+    the others by their largest, and then each column by its largest element. The blocks off the
+    diagonal are `∂F/∂y'` alone, up to a factor.
     """
     n = len(b) // 3
-    has_slopes = jnp.any(matrix[:n, n : 2 * n] != 0, axis=0)
-    return solve_equilibrated(matrix, b, jnp.tile(has_slopes, 3))
+    has_slopes = matrix[:n, n : 2 * n] != 0
+    equations, unknowns = (jnp.tile(jnp.any(has_slopes, axis=axis), 3) for axis in (1, 0))
+    return solve_equilibrated(matrix, b, equations[:, None] & unknowns)
 
 
 class DenseSystems(NamedTuple):

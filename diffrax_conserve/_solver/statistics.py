@@ -8,11 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._constants import TOLERANCE_IN_EPS
 from .._custom_types import Manifold
 from .._manifold import entry_names
 from .._numerics.report import ProjectionInfo
 from .._options import found_in
 from .._printing import is_traced, names_at, printed
+from .._tree import eps_of
 
 # Corrections are usually shorter than error estimates, because these are for a method of lower
 # order. If the largest correction is this many times the largest estimate, the quantity is probably
@@ -75,8 +77,11 @@ class ProjectionStatistics(eqx.Module):
         if np.all(np.isnan(self.error)):
             del rows["error"]
         text = printed("projections of the accepted steps", rows)
-        suspicious = np.asarray(self.correction) > _MAX_PLAUSIBLE * np.asarray(self.error)
-        if not self.bounded and np.any(suspicious):
+        correction, error = np.asarray(self.correction), np.asarray(self.error)
+        before = np.asarray(self.residual_before)
+        # A residual that a projection may leave as it is, is roundoff, and so is its correction.
+        is_seen = before > TOLERANCE_IN_EPS * eps_of(before)
+        if not self.bounded and np.any(is_seen & (correction > _MAX_PLAUSIBLE * error)):
             text += (
                 "\nCorrections are far longer than the error estimates of the steps explain:"
                 "\ncheck by `check_invariance` that the quantities are conserved."

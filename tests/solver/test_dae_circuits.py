@@ -103,7 +103,36 @@ def test_diodes_that_block_leave_no_current_but_roundoff():
     np.testing.assert_allclose(y[0] - y[1], source(time), rtol=1e-12)
 
 
-@pytest.mark.parametrize("copies", [1, 25])
+def test_derivatives_through_diodes_that_block():
+    """With the least conductance of circuit simulators beside each diode, the mean of two voltages
+    is hardly determined while all block. What it is decides about nothing, so that a derivative is
+    as exact as the solution."""
+
+    def charging(t, x, z, peak):
+        return (diode(z[0] - x) + diode(z[1] - x) - x / 100) / 470e-6
+
+    def kirchhoff(t, x, z, peak):
+        through = lambda voltage: diode(voltage) + 1e-12 * voltage  # noqa: E731
+        current = (peak / PEAK * source(t) - (z[0] - z[1])) / 0.5
+        into = current - through(z[0] - x) + through(-z[0])
+        return jnp.stack([into, -current - through(z[1] - x) + through(-z[1])])
+
+    dae = dfc.DAE(charging, algebraic=kirchhoff)
+    steps = dfx.PIDController(rtol=1e-7, atol=1e-7)
+
+    def end(peak):
+        y0 = dae.consistent(jnp.zeros(()), jnp.zeros(2), args=peak)
+        options = dict(stepsize_controller=steps, adjoint=dfx.ForwardMode(), max_steps=1024)
+        solver = dae.wrap(dfc.Radau())
+        found = dfx.diffeqsolve(dae.term, solver, 0.0, 6e-3, 1e-6, y0, peak, **options)
+        return found.ys[0][-1]
+
+    derivative = jax.jit(lambda peak: jax.jvp(end, (peak,), (1.0,)))
+    (above, _), (below, _) = derivative(PEAK + 1e-2), derivative(PEAK - 1e-2)
+    np.testing.assert_allclose(derivative(PEAK)[1], (above - below) / 2e-2, rtol=2e-5)
+
+
+@pytest.mark.parametrize("copies", [1, pytest.param(25, marks=pytest.mark.slow)])
 def test_a_virtual_ground_has_not_moved(copies):
     """A differentiator by an ideal amplifier, whose input is at a voltage of zero all the time: an
     unknown that has no size. Its transient ends within microseconds. By sparse matrices too."""

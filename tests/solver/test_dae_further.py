@@ -1,5 +1,7 @@
 """What `DAE.wrap` keeps beside the equations: exact solutions, and pendulums in angles by scipy."""
 
+import itertools
+
 import diffrax as dfx
 import equinox as eqx
 import jax
@@ -11,6 +13,7 @@ from scipy.integrate import solve_ivp
 import diffrax_conserve as dfc
 
 from ..problems import EPS, TO_THE_END, largest, refused
+from ..thinned import some_of
 from .test_dae import CUBIC, constant
 
 GRAVITY = 9.81
@@ -199,14 +202,15 @@ def pendulum_with(output):
     return dfc.DAE(residual=residual)
 
 
-@pytest.mark.parametrize(
-    ("output", "dtype"),
+@some_of(
+    "output, dtype",
     [
         (lambda z, q, v, force: z - 0.3 * force, jnp.float64),
         (lambda z, q, v, force: z - 2e3 * force, jnp.float32),
         (lambda z, q, v, force: z * jnp.exp(q[0]) - q[1] * v[0] * force, jnp.float64),
     ],
     ids=["a share of the force", "the force in another unit", "a nonlinear function of all"],
+    period=3,
 )
 def test_an_output_changes_nothing(output, dtype):
     """The states are those without it, and so is their derivative by the first angle."""
@@ -233,12 +237,14 @@ def test_an_output_changes_nothing(output, dtype):
         np.testing.assert_allclose(a, b, rtol=200 * eps, atol=200 * eps)
 
 
-@pytest.mark.parametrize("solver", [dfc.Radau(), dfx.Tsit5()], ids=lambda x: type(x).__name__)
-@pytest.mark.parametrize("names", [np.eye(2), np.array([[1.0, 1.0], [1.0, -1.0]])])
+NAMES_OF_CURRENTS = {"each": np.eye(2), "sum": np.array([[1.0, 1.0], [1.0, -1.0]])}
+
+
+@some_of("solver, names", itertools.product((dfc.Radau, dfx.Tsit5), NAMES_OF_CURRENTS), period=2)
 def test_cells_in_parallel_share_the_current(solver, names):
     """Two linear ones, of index 2, so that each has its share of the charge for ever, whatever the
     two unknown currents are: those of the cells, or their sum and their difference."""
-    names = jnp.asarray(names)
+    names = jnp.asarray(NAMES_OF_CURRENTS[names])
 
     def f(t, x, z, capacities):
         return 1e-3 * (names @ z[:2]) / capacities
@@ -252,7 +258,7 @@ def test_cells_in_parallel_share_the_current(solver, names):
         capacities = jnp.stack([first, jnp.array(1.1)])
         charges = jnp.array([0.29, 0.31])  # which are equal in the nearest consistent state
         y0 = dae.consistent(charges, jnp.array([1.0, 2.0, 3.0]), args=capacities)
-        found = solve(dae, dae.wrap(solver), jnp.array([0.0, time]), y0, capacities)
+        found = solve(dae, dae.wrap(solver()), jnp.array([0.0, time]), y0, capacities)
         x, z = jax.tree.map(lambda x: x[-1], found.ys)
         return (x, names @ z[:2], z[2]), found.result
 

@@ -18,6 +18,8 @@ from diffrax_conserve._dae import dae as dae_module
 from diffrax_conserve._dae import search, stage_systems
 from diffrax_conserve._large.klu import why_not
 
+from ..thinned import some_of
+
 if why_not():
     pytest.skip(why_not(), allow_module_level=True)
 
@@ -179,7 +181,7 @@ def of_all_but(*slow):
 
 
 # The chain takes as long as all others; `test_numbers_known_by_hand` has a long one.
-@of_all_but(chain)
+@of_all_but(chain, carts, heat, ring, pairs)
 def test_structure_and_constraints_are_those_of_dense_matrices(make, n, monkeypatch):
     """At a state that is not consistent, with slopes that do not belong to it."""
 
@@ -217,10 +219,7 @@ def test_consistent_states_and_slopes_are_those_of_dense_matrices(make, n, monke
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "n"),
-    [(pairs, 60), (cells, 30), (filtered, 120), pytest.param(chain, 24, marks=pytest.mark.slow)],
-)
+@some_of("make, n", [(pairs, 60), (cells, 30), (filtered, 120), (chain, 24)], period=4)
 def test_consistent_states_of_a_higher_index_are_those_of_dense_matrices(make, n, monkeypatch):
     """With 120 or 121 unknowns, index 2 and 3; and inside of another program."""
 
@@ -288,7 +287,7 @@ def test_the_currents_of_a_large_pack():
     np.testing.assert_allclose(currents, 40 * share, rtol=1e-12)
 
 
-@pytest.mark.parametrize("push", [0.0, 9.81])
+@some_of("push", [0.0, 9.81], period=2)
 def test_forces_that_vanish_or_are_unknown(push):
     """A net of rods with 946 unknowns and closed loops. In free fall no rod has a force, and the
     accelerations cancel to roundoff; where one corner is pushed they have one."""

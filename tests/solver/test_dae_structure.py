@@ -1,6 +1,8 @@
 """The structure of a DAE belongs to the equations: it depends neither on what is called first nor
 on values, unless `at` says so. What is below roundoff is no error."""
 
+import itertools
+
 import diffrax as dfx
 import jax
 import jax.numpy as jnp
@@ -11,6 +13,7 @@ import diffrax_conserve as dfc
 from diffrax_conserve._dae.dae import _Constraints, _structure
 
 from ..problems import EPS, refused
+from ..thinned import some_of
 
 GUESS = jnp.array([0.5, 0.2])
 
@@ -134,7 +137,7 @@ def test_hidden_constraints_solve_for_one_slope_at_a_time():
     assert sum(map(np.prod, (np.shape(one.slopes) for one in last.blocks))) == 35
 
 
-@pytest.mark.parametrize("power", [1, 3])
+@pytest.mark.parametrize("power", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_linear_in_the_slopes_that_are_not_known_yet(power):
     """Lagrange's equations may be written with slopes in the place of velocities: in the
     accelerations they are linear. Not so, if they contain a power of these."""
@@ -244,7 +247,7 @@ def orthogonal(n, seed):
     return np.linalg.qr(np.random.default_rng(seed).normal(size=(n, n)))[0]
 
 
-@pytest.mark.parametrize("mixed", [False, True])
+@pytest.mark.parametrize("mixed", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_roundoff_of_a_combination_is_no_equation(mixed):
     """Of index 2: condensers between the nodes 1 and 2, and 1 and 5, a voltage between 5 and 1,
     resistors from 2 by 4 to 3, and a coil as the only way to the ground. So no current flows in the
@@ -300,8 +303,7 @@ OUTPUTS = {
 }
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
-@pytest.mark.parametrize("speed", [0.0, 1.0])
+@some_of("name, speed", itertools.product(OUTPUTS, (0.0, 1.0)), period=3)
 def test_an_output_changes_no_consistent_state(name, speed):
     """A double pendulum whose positions satisfy their constraints keeps them, with an output that
     nothing depends on, and whether it is at rest or not."""

@@ -22,6 +22,7 @@ from ..problems import (
     rigid_body,
     solve,
 )
+from ..thinned import some_of
 
 BALL = dfc.ManifoldProjection(dfx.Heun(), RIGID_BODY)
 
@@ -331,9 +332,7 @@ def test_a_stochastic_term_of_ones_own_class_changes_nothing():
     np.testing.assert_array_equal(solved(term), solved(OwnTerm(term)))
 
 
-@pytest.mark.parametrize(
-    ("m", "dtype"), [(1, "float64"), (3, "float32"), (6, "float64"), (20, "float32")]
-)
+@some_of("m, dtype", [(1, "float64"), (3, "float32"), (6, "float64"), (20, "float32")], period=2)
 def test_strict_promotion_and_rank_promotion(m, dtype):
     """Alone and in a batch, for each way in which dense constraints are solved."""
 
