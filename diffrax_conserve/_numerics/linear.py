@@ -152,11 +152,13 @@ def ldu_factors(
         matrix = jnp.where(is_remaining[:, None] | is_remaining[None], rest, matrix)
         return matrix, pivot_step + is_k.astype(int) * (k - m)
 
-    pivot_step = jnp.full((m, *lanes) if pivoting else j.shape, m)
+    pivot_step = np.full(j.shape, m)
     if m > 1:  # all relative pivots are one, so that the natural order will do
         matrix, pivot_step = eliminate(0, (matrix, pivot_step), False)
     if m > 2:
         steps = ft.partial(eliminate, pivoting=pivoting)
+        if pivoting:
+            pivot_step = jnp.broadcast_to(pivot_step, (m, *lanes))
         matrix, pivot_step = lax.fori_loop(1, m - 1, steps, (matrix, pivot_step))
     return jnp.where(on_diagonal, nonzero(_diagonal(matrix), size), matrix), pivot_step
 
