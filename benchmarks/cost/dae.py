@@ -258,7 +258,7 @@ def by_radau(problem, rtol):
 def for_ida(dae, y, args):
     """The equations of index 1 in place, and their Jacobian, as IDA wants them."""
     _, rebuild = jax.flatten_util.ravel_pytree(y)
-    equations = dae.wrap(dfc.Radau()).solver.equations
+    equations = dae.wrap(dfc.Radau()).solver._equations
     value = jax.jit(lambda t, y, dy: equations(t, rebuild(y), rebuild(dy), args))
     slopes = jax.jit(jax.jacfwd(value, (1, 2)))
 

@@ -1,7 +1,8 @@
 """Stiff ordinary equations by `Radau`, by Kvaerno5 of diffrax, and by the `Radau` of scipy.
 
-For each tolerance: accepted steps, the digits of the worst component at the end, and the time of a
-solve that is compiled. The reference is `Radau` at a tolerance of 1e-12.
+For each tolerance: accepted steps, the digits of the worst component at the end, and the least
+time of three solves that are compiled. The references are those of the test set of initial value
+problems (Mazzia and Magherini, Bari 2008).
 
 Run: `python benchmarks/cost/stiff.py` (a minute). `--smoke` runs one tolerance of one problem.
 """
@@ -40,12 +41,22 @@ def hires(t, y, args):
     ])  # fmt: skip
 
 
-# The field, the end, the start, and the absolute tolerance over the relative one.
+# The field, the end, the start, the absolute tolerance over the relative one, and the reference.
 PROBLEMS = {
-    "van der Pol, 1e6": (van_der_pol, 2.0, [2.0, 0.0], 1e-2),
-    "Robertson": (robertson, 1e11, [1.0, 0.0, 0.0], 1e-6),
-    "HIRES": (hires, 321.8122, [1.0, 0, 0, 0, 0, 0, 0, 0.0057], 1e-2),
-}
+    "van der Pol, 1e6": (
+        van_der_pol, 2.0, [2.0, 0.0], 1e-2, [1.706167732170483, -0.8928097010247975]
+    ),
+    "Robertson": (
+        robertson, 1e11, [1.0, 0.0, 0.0], 1e-6,
+        [0.2083340149701255e-7, 0.8333360770334713e-13, 0.9999999791665050],
+    ),
+    "HIRES": (
+        hires, 321.8122, [1.0, 0, 0, 0, 0, 0, 0, 0.0057], 1e-2,
+        [0.7371312573325668e-3, 0.1442485726316185e-3, 0.5888729740967575e-4,
+         0.1175651343283149e-2, 0.2386356198831331e-2, 0.6238968252742796e-2,
+         0.2849998395185769e-2, 0.2850001604814231e-2],
+    ),
+}  # fmt: skip
 
 
 def solved(field, end, start, solver, tolerance, scale):
@@ -60,10 +71,12 @@ def solved(field, end, start, solver, tolerance, scale):
         )
 
     y0 = jnp.array(start)
-    jax.block_until_ready(run(y0, tolerance))
-    begin = time.perf_counter()
-    found = jax.block_until_ready(run(y0, tolerance))
-    return int(found.stats["num_accepted_steps"]), found.ys[-1], time.perf_counter() - begin
+    found, least = run(y0, tolerance), np.inf
+    for _ in range(3):
+        begin = time.perf_counter()
+        found = jax.block_until_ready(run(y0, tolerance))
+        least = min(least, time.perf_counter() - begin)
+    return int(found.stats["num_accepted_steps"]), found.ys[-1], least
 
 
 def main(smoke):
@@ -74,13 +87,12 @@ def main(smoke):
         end="",
     )
     print(" scipy: steps |\n|---|---|---|---|---|---|---|---|---|")
-    for name, (field, end, start, scale) in problems.items():
-        exact = solved(field, end, start, dfc.Radau(), 1e-12, scale)[1]
+    for name, (field, end, start, scale, exact) in problems.items():
         for tolerance in tolerances:
             row = [name, f"{tolerance:.0e}"]
             for solver in (dfc.Radau(), diffrax.Kvaerno5()):
                 steps, y, seconds = solved(field, end, start, solver, tolerance, scale)
-                digits = -np.log10(np.max(np.abs(y / exact - 1)))
+                digits = -np.log10(np.max(np.abs(y / np.array(exact) - 1)))
                 row += [f"{steps:,}", f"{digits:.1f}", f"{1e3 * seconds:.1f}"]
             numpy_field = jax.jit(lambda t, y, field=field: field(t, y, None))
             found = solve_ivp(
