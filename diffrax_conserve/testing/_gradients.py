@@ -47,7 +47,7 @@ def assert_gradients(
     **Raises:**
 
     `AssertionError` that names the argument; NaN never passes. `ValueError` if nothing can be
-    varied.
+    varied or compared.
 
     !!! example
 
@@ -73,10 +73,12 @@ def assert_gradients(
     def values(x: Array) -> Any:
         return eqx.filter(f(*eqx.combine(unravel(x, varied), fixed)), eqx.is_inexact_array)
 
-    value = lambda x: ravel(values(x))  # noqa: E731
+    outputs = jtu.tree_leaves(values(x))
+    if not outputs:
+        raise ValueError("`f` returns no floating-point array, so there is nothing to compare.")
+    value, output = lambda x: ravel(values(x)), ravel(outputs)
+    eps = max(map(eps_of, leaves + outputs))
     rng = np.random.default_rng(seed)
-    output = value(x)
-    eps = max(map(eps_of, jtu.tree_leaves((varied, values(x)))))
     cotangent = jnp.asarray(rng.normal(size=output.shape), output.dtype)
     pullback = jax.jit(lambda x: jax.vjp(value, x)[1](cotangent)[0])
     by_reverse = pullback(x) if reverse else jnp.zeros_like(x)

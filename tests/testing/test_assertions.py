@@ -154,6 +154,7 @@ def test_nothing_to_check_is_an_error():
         ("`y0=...`", dct.assert_conserved, rows_of(sol, 20), RIGID_BODY),
         ("`value=...`", dct.assert_on_manifold, RIGID_BODY, OMEGA0),
         ("nothing to vary", dct.assert_gradients, lambda n: n, 3),
+        ("nothing to compare", dct.assert_gradients, lambda x: 3, 1.0),
     ]:
         with pytest.raises(ValueError, match=re.escape(match)):
             function(*args)
