@@ -198,7 +198,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             was rejected, the error is as large as the second, in which this is damped. Then the
             next step is not longer."""
             largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
-            of_once, of_twice = (size(error[None], largest[None]) for error in (once, twice))
+            size_of = jax.vmap(lambda error: size(error[None], largest[None]))
+            of_once, of_twice = size_of(jnp.stack([once, twice]))
             was_rejected = length < _SAFETY * last.length
             enough = jnp.maximum(of_twice, _SAFETY**4) / jnp.where(of_once > 0, of_once, 1)
             return once * jnp.where(was_rejected & (of_once >= 1), jnp.minimum(enough, 1), 1)
