@@ -39,8 +39,9 @@ _TO_MODES = np.linalg.inv(_VECTORS)
 # The weights of the increments in the error estimate.
 _ERROR = np.array([-13 - 7 * 6**0.5, -13 + 7 * 6**0.5, -1.0]) / 3
 
-# By default a step after an accepted one is at least this share of it, and one that is much shorter
-# follows a rejected one; with an error estimate of this to the fourth it is as long.
+# The safety factor of diffrax's controllers. A step that follows an accepted one is at least this
+# share of it, so that a shorter one follows a rejected one. Where the error estimate is this number
+# to the fourth, for a method of order three, the next step is as long.
 _SAFETY = 0.9
 
 
@@ -61,8 +62,8 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
     and dense output is $u$ itself. The three stages are solved for together, by Newton's method
     with one Jacobian for a step, from the polynomial of the last step as a guess; the linear
     systems are one real and one complex one of the size of the state. The error estimate is that
-    of an embedded method of order three, which damps stiff components: once, and after a step was
-    rejected twice.
+    of an embedded method of order three, which damps stiff components: once, or twice in a step
+    that follows a rejected one, as in the code RADAU5 of the reference.
 
     From 100 unknowns on, in float64 on a CPU, the linear systems are sparse: which elements of the
     Jacobian can differ from zero is found when the solve is traced, and KLU solves them. That takes
@@ -200,7 +201,7 @@ class Radau(Hashable, dfx.AbstractImplicitSolver[_Last]):
             largest = jnp.maximum(jnp.abs(start), jnp.abs(end))
             size_of = jax.vmap(lambda error: size(error[None], largest[None]))
             of_once, of_twice = size_of(jnp.stack([once, twice]))
-            was_rejected = length < _SAFETY * last.length
+            was_rejected = length / last.length < _SAFETY  # both are negative backwards in time
             enough = jnp.maximum(of_twice, _SAFETY**4) / jnp.where(of_once > 0, of_once, 1)
             return once * jnp.where(was_rejected & (of_once >= 1), jnp.minimum(enough, 1), 1)
 

@@ -253,3 +253,18 @@ def test_a_constraint_that_jumps_is_told_at_a_declared_jump():
     assert CANNOT_START in told
     assert "`project`, and go on" in told
     assert result(1.0) == dfx.RESULTS.successful
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_statistics_tell_a_law_that_is_not_conserved_from_roundoff(factor):
+    """In float32, where the error estimates of short steps are below the roundoff that is
+    corrected."""
+    law = dfc.FirstIntegral(lambda t, y, args: y[0] ** 2 + factor * y[1] ** 2)
+    found = dfx.diffeqsolve(
+        dfx.ODETerm(oscillator), dfc.ManifoldProjection(dfx.Tsit5(), law),
+        *np.float32([0.0, 5.0, 0.02]), np.float32([1.0, 0.0]),
+        saveat=dfx.SaveAt(t1=True, solver_state=True), max_steps=300,
+    )  # fmt: skip
+    statistics = dfc.statistics(found)
+    assert statistics.correction > 10 * statistics.error
+    assert ("check by `check_invariance`" in str(statistics)) == (factor != 1)

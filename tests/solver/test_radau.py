@@ -78,22 +78,24 @@ def test_a_stage_is_collocation():
 
 def test_the_error_of_a_component_that_follows_a_force_is_controlled():
     """`y' = λ (cos t - y)` (A. Prothero and A. Robinson, 1974), from the solution without a
-    transient and from another start, stiff or not: in each step by some tolerances, and without
-    many steps that are rejected, because a transient is left from the step before."""
+    transient and from another start, stiff or not, and the same backwards in time: in each step by
+    some tolerances, and without many steps that are rejected, because a transient is left from the
+    step before."""
 
     @jax.jit
     @jax.vmap
-    def worst(rate, tol, off):
-        exact = lambda t: rate * (rate * jnp.cos(t) + jnp.sin(t)) / (rate**2 + 1)  # noqa: E731
-        field = dfx.ODETerm(lambda t, y, args: rate * (jnp.cos(t) - y))
+    def worst(rate, tol, off, way):
+        exact = lambda t: rate * (rate * jnp.cos(t) + way * jnp.sin(t)) / (rate**2 + 1)  # noqa: E731
+        field = dfx.ODETerm(lambda t, y, args: way * rate * (jnp.cos(t) - y))
         steps = dfx.PIDController(rtol=tol, atol=tol)
         options = dict(stepsize_controller=steps, saveat=dfx.SaveAt(steps=True), max_steps=1024)
-        found = dfx.diffeqsolve(field, dfc.Radau(), 0.0, 10.0, 1e-6, exact(0.0) + off, **options)
-        transient = off * jnp.exp(-rate * found.ts)
+        times = 0.0, way * 10.0, way * 1e-6
+        found = dfx.diffeqsolve(field, dfc.Radau(), *times, exact(0.0) + off, **options)
+        transient = off * jnp.exp(-rate * jnp.abs(found.ts))
         error = jnp.abs(found.ys - exact(found.ts) - transient) / (1 + jnp.abs(found.ys))
         return jnp.max(jnp.where(jnp.isfinite(found.ts), error, 0)) / tol, found.stats
 
-    cases = itertools.product([1e2, 1e4, 1e6], [1e-4, 1e-6, 1e-8], [0.0, 1.0])
+    cases = itertools.product([1e2, 1e4, 1e6], [1e-4, 1e-6, 1e-8], [0.0, 1.0], [1.0, -1.0])
     error, stats = worst(*map(np.array, zip(*cases, strict=True)))
     assert np.max(error) < 5
     assert np.all(stats["num_rejected_steps"] <= 5 + stats["num_accepted_steps"] / 2)
